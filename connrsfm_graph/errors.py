@@ -1,0 +1,11 @@
+"""The two ways a run can end badly. Both carry one sentence meant for the user."""
+
+from __future__ import annotations
+
+
+class InputError(ValueError):
+    """The input cannot be used. The message names the file or field and what was expected (exit status 2)."""
+
+
+class ComputationError(RuntimeError):
+    """The input is fine but the computation failed (exit status 1)."""
