@@ -221,15 +221,17 @@ def _ranges(frames: np.ndarray) -> str:
 
 
 def _maximum_spanning_tree(n_frames: int, pairs: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Indices of the tree's edges; among equal weights Kruskal's stable order takes the earlier candidate."""
+    """Indices of the tree's edges, heaviest first; among equal weights the earlier candidate wins.
+
+    The tree depends on the order of the weights only, so it is the minimum spanning tree of the ranks, which have no
+    ties and make the choice independent of the order in which networkx visits edges.
+    """
+    order = np.argsort(-weight, kind="stable")
     graph = nx.Graph()
     graph.add_nodes_from(range(n_frames))
-    graph.add_edges_from(
-        (a, b, {"weight": w, "index": i})
-        for i, (a, b, w) in enumerate(zip(*pairs.T.tolist(), weight.tolist(), strict=True))
-    )
-    tree = nx.maximum_spanning_edges(graph, algorithm="kruskal", data=True)
-    return np.array([data["index"] for _, _, data in tree], dtype=np.int64)
+    graph.add_weighted_edges_from((a, b, rank) for rank, (a, b) in enumerate(pairs[order].tolist()))
+    tree = nx.minimum_spanning_edges(graph, algorithm="kruskal", data=True)
+    return order[[data["weight"] for _, _, data in tree]]
 
 
 def _factorise(n_frames: int, edges: np.ndarray, weight: np.ndarray) -> SuperLU:
