@@ -1,0 +1,142 @@
+"""Isometry and discrete conformal equivalence: a chord of a view against the latent length of a mesh edge.
+
+Points i and k, joined by an edge of a mesh on the surface, are seen in view j on corrected sight rays:
+X = exp(b) (x + q, 1) with log depth b, tracked image point x and ray correction q. The residual is
+
+    r = log |X_i - X_k| + a - e - (f_i + f_k) / 2,
+
+with e the log length of the edge, shared by all views. Without the log conformal factors f it says that views are
+isometric; with them it is discrete conformal equivalence (Springborn, Schroeder and Pinkall 2008), which Moebius
+maps fulfil exactly, chord by chord. The offset a turns the chord into an arc: over a surface curve that leaves the
+chord with slopes s_i and s_k it is `arc_offset`, and zero where the chord itself is meant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import gtsam
+import numpy as np
+from numba import njit
+
+from factors.adapter import make_factor
+from factors.jacobian_check import Example
+from factors.keys import LOG_DEPTH, LOG_FACTOR, LOG_LENGTH, RAY_CORRECTION, key
+
+
+@njit(cache=True, inline="always")
+def log_chord_kernel(xi, yi, zi, xk, yk, zk):
+    """Log chord length and its derivatives with respect to (b, q1, q2) of the first and of the second point.
+
+    The arguments are the coordinates of both points in the camera frame; since X = z (x + q, 1), the derivative of a
+    point with respect to its log depth is the point, and with respect to the ray correction z times the unit vector.
+    """
+    dx, dy, dz = xi - xk, yi - yk, zi - zk
+    square = dx * dx + dy * dy + dz * dz
+    gx, gy, gz = dx / square, dy / square, dz / square
+    return (
+        0.5 * np.log(square),
+        gx * xi + gy * yi + gz * zi,
+        gx * zi,
+        gy * zi,
+        -(gx * xk + gy * yk + gz * zk),
+        -gx * zk,
+        -gy * zk,
+    )
+
+
+@njit(cache=True, inline="always")
+def arc_offset(slope_i, slope_k):
+    """Log ratio of arc to chord of the cubic that leaves the chord with these slopes at its two ends.
+
+    To second order in the slopes: the mean of y'^2 / 2 over the chord. For a circle of radius R (slopes of opposite
+    sign) it is the familiar length^2 / (24 R^2).
+    """
+    return (2.0 * slope_i * slope_i + 2.0 * slope_k * slope_k - slope_i * slope_k) / 30.0
+
+
+@njit(cache=True)
+def _residual(image_i, image_k, offset, b_i, q_i, b_k, q_k, e, derivatives):
+    z_i, z_k = np.exp(b_i[0]), np.exp(b_k[0])
+    chord = log_chord_kernel(
+        z_i * (image_i[0] + q_i[0]),
+        z_i * (image_i[1] + q_i[1]),
+        z_i,
+        z_k * (image_k[0] + q_k[0]),
+        z_k * (image_k[1] + q_k[1]),
+        z_k,
+    )
+    for c in range(6):
+        derivatives[c] = chord[1 + c]
+    return chord[0] + offset - e[0]
+
+
+class EdgeLength:
+    """One row over (b_i, q_i, b_k, q_k, e) and, in conformal use, (f_i, f_k)."""
+
+    __slots__ = ("image_i", "image_k", "offset")
+    name = "edge length"
+    rows = 1
+
+    def __init__(self, image_i: np.ndarray, image_k: np.ndarray, offset: float):
+        self.image_i = np.asarray(image_i, dtype=float)
+        self.image_k = np.asarray(image_k, dtype=float)
+        self.offset = float(offset)
+
+    def residual(self, *x: np.ndarray) -> np.ndarray:
+        return self.jacobians(*x)[0]
+
+    def jacobians(self, *x: np.ndarray) -> tuple[np.ndarray, Sequence[np.ndarray]]:
+        gradient = np.empty((1, 6))
+        r = _residual(self.image_i, self.image_k, self.offset, *x[:5], gradient[0])
+        blocks = [gradient[:, :1], gradient[:, 1:3], gradient[:, 3:4], gradient[:, 4:], np.array([[-1.0]])]
+        if len(x) == 7:
+            r -= 0.5 * (x[5][0] + x[6][0])
+            blocks += [np.array([[-0.5]]), np.array([[-0.5]])]
+        return np.array([r]), blocks
+
+
+def edge_length_factor(
+    edge: int,
+    point_i: int,
+    point_k: int,
+    view: int,
+    image_i: np.ndarray,
+    image_k: np.ndarray,
+    noise: gtsam.noiseModel.Base,
+    offset: float = 0.0,
+    conformal: bool = False,
+) -> gtsam.CustomFactor:
+    """The chord of mesh edge `edge` in one view against its latent log length.
+
+    Args:
+        edge, point_i, point_k, view: indices of the variables: log depths and ray corrections of both points in the
+            view, the log length of the edge and, if `conformal`, the log conformal factors of both points.
+        image_i, image_k: (2,) tracked points, normalised coordinates.
+        noise: one-dimensional noise of the log length, robust or not.
+        offset: log ratio of arc to chord, see `arc_offset`.
+        conformal: compare up to the conformal factors of the two points.
+    """
+    keys = [
+        key(LOG_DEPTH, point_i, view),
+        key(RAY_CORRECTION, point_i, view),
+        key(LOG_DEPTH, point_k, view),
+        key(RAY_CORRECTION, point_k, view),
+        key(LOG_LENGTH, edge),
+    ]
+    dims = [1, 2, 1, 2, 1]
+    if conformal:
+        keys += [key(LOG_FACTOR, point_i, view), key(LOG_FACTOR, point_k, view)]
+        dims += [1, 1]
+    return make_factor(EdgeLength(image_i, image_k, offset), keys, dims, noise)
+
+
+def examples(rng: np.random.Generator) -> Iterator[Example]:
+    """Isometric and conformal factors at random points, for the Jacobian check."""
+    for conformal in (False, True):
+        noise = gtsam.noiseModel.Isotropic.Sigma(1, 0.3)
+        factor = edge_length_factor(2, 0, 1, 3, *rng.normal(0, 0.4, (2, 2)), noise, 0.01, conformal)
+        values = gtsam.Values()
+        for k, dim in zip(factor.keys(), (1, 2, 1, 2, 1, 1, 1), strict=False):
+            values.insert(k, rng.normal(0.0, 0.2, dim))
+        yield "conformal" if conformal else "isometric", factor, values
