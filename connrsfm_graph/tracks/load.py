@@ -55,7 +55,7 @@ def save_tracks(path: str | Path, tracks: Tracks) -> None:
     path = Path(path)
     if path.suffix.lower() != ".npz":
         raise InputError(f"{path}: unknown ending '{path.suffix}', expected .npz")
-    same_camera = bool((tracks.K == tracks.K[0]).all())
+    same_camera = bool((tracks.K[0] == tracks.K).all())
     arrays = {
         "tracks": tracks.pixels,
         "K": tracks.K[0] if same_camera else tracks.K,

@@ -1,0 +1,154 @@
+"""Whether tracks can be reconstructed, said before hours are spent on them.
+
+What makes a reconstruction impossible is an error that names the image or the number; what one can live with is mended
+by hiding observations, so that shapes stay as given, and told as a warning.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from connrsfm_graph.errors import InputError
+from connrsfm_graph.tracks.tracks import Tracks
+
+MIN_FRAMES = 3
+"""Two images of a bending surface leave two solutions for its normals at every point."""
+MIN_POINTS = 6
+"""A warp needs more than the three points an affinity passes through exactly."""
+_SAME_PIXEL = 1e-6
+"""Points closer than this, in pixels, are at the same place; finer than any tracker measures."""
+_THIN = 1e-4
+"""Points whose spread across is less than this share of their spread along lie on a line."""
+_COMPARISONS = 8
+"""Other images each image's handedness is compared with."""
+
+
+def check_reconstructable(tracks: Tracks, source: str = "tracks") -> tuple[Tracks, tuple[str, ...]]:
+    """Tracks fit for a reconstruction, and a warning for everything that was hidden or looks wrong.
+
+    Where several points lie at the same pixel of an image only the first stays visible there: the surface between them
+    would have no extent.
+
+    Args:
+        tracks: any consistent tracks.
+        source: what to call them in messages, usually the file's name.
+
+    Raises:
+        InputError: too few images or points, an image that shows too few points or only points on a line, a mirrored
+            image, or no point seen twice.
+    """
+    if tracks.n_frames < MIN_FRAMES:
+        raise InputError(
+            f"{source}: shows {tracks.n_frames} images, expected at least {MIN_FRAMES} because two views of a bending "
+            "surface leave its normals ambiguous"
+        )
+    if tracks.n_points < MIN_POINTS:
+        raise InputError(
+            f"{source}: holds {tracks.n_points} points, expected at least {MIN_POINTS} to warp one image to another"
+        )
+    empty = np.flatnonzero(~tracks.visible.any(axis=1))
+    if len(empty):
+        raise InputError(f"{source}: {_frames(empty)} shows no point at all; leave it out")
+    rare = _rarely_seen(tracks, source)
+    tracks, coincident = _hide_coincident(tracks)
+    counts = tracks.visible.sum(axis=1)
+    poor = np.flatnonzero(counts < MIN_POINTS)
+    if len(poor):
+        raise InputError(
+            f"{source}: {_frames(poor)} shows {counts[poor[0]]} points, expected at least {MIN_POINTS}; leave it out "
+            "or track more points"
+        )
+    _refuse_lines(tracks, source)
+    _refuse_mirrored(tracks, source)
+    return tracks, (*coincident, *rare, *_odd_camera(tracks))
+
+
+def _hide_coincident(tracks: Tracks) -> tuple[Tracks, list[str]]:
+    visible = tracks.visible.copy()
+    hidden_in = np.zeros(tracks.n_points, dtype=int)
+    twin = np.zeros(tracks.n_points, dtype=int)
+    for frame in range(tracks.n_frames):
+        seen = np.flatnonzero(visible[frame])
+        cells = np.round(tracks.pixels[frame, seen] / _SAME_PIXEL)
+        _, first, which = np.unique(cells, axis=0, return_index=True, return_inverse=True)
+        kept = seen[first[which.ravel()]]
+        later = seen != kept
+        visible[frame, seen[later]] = False
+        hidden_in[seen[later]] += 1
+        twin[seen[later]] = kept[later]
+    if not hidden_in.any():
+        return tracks, []
+    worst = int(np.argmax(hidden_in))
+    warning = (
+        f"{np.count_nonzero(hidden_in)} points lie at the same pixel as another one (point {worst} as point "
+        f"{twin[worst]}, in {hidden_in[worst]} images); the later of them is taken as not visible there"
+    )
+    return replace(tracks, visible=visible, pixels=np.where(visible[..., None], tracks.pixels, np.nan)), [warning]
+
+
+def _refuse_lines(tracks: Tracks, source: str) -> None:
+    for frame in range(tracks.n_frames):
+        points = tracks.pixels[frame, tracks.visible[frame]]
+        spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+        if spread[1] <= _THIN * spread[0]:
+            raise InputError(f"{source}: all points of image {frame} lie on one line, expected a surface; leave it out")
+
+
+def _refuse_mirrored(tracks: Tracks, source: str) -> None:
+    """The warp between two images of one side of a surface keeps handedness, so its best affinity has det > 0."""
+    F = tracks.n_frames
+    others = np.unique(np.linspace(1, F - 1, min(_COMPARISONS, F - 1)).round().astype(int))
+    flipped = np.zeros(F, dtype=int)
+    compared = np.zeros(F, dtype=int)
+    for frame in range(F):
+        for other in (frame + others) % F:
+            both = tracks.visible[frame] & tracks.visible[other]
+            if both.sum() < MIN_POINTS:
+                continue
+            flipped[frame] += _handedness(tracks.pixels[frame, both], tracks.pixels[other, both]) < 0
+            compared[frame] += 1
+    mirrored = np.flatnonzero(2 * flipped > compared)
+    if len(mirrored):
+        raise InputError(
+            f"{source}: {_frames(mirrored)} shows the points mirrored against the other images; turn x (or y) around "
+            "there, or leave it out"
+        )
+
+
+def _handedness(a: np.ndarray, b: np.ndarray) -> float:
+    """Sign of the determinant of the affinity that best maps points a to b, (N, 2) each; 0 where nearly singular."""
+    a, b = a - a.mean(axis=0), b - b.mean(axis=0)
+    A = np.linalg.lstsq(a, b, rcond=None)[0]
+    size = np.linalg.norm(A)
+    det = np.linalg.det(A)
+    return 0.0 if abs(det) <= 0.01 * size**2 else float(np.sign(det))
+
+
+def _rarely_seen(tracks: Tracks, source: str) -> list[str]:
+    rare = np.flatnonzero(tracks.visible.sum(axis=0) < 2)
+    if len(rare) == tracks.n_points:
+        raise InputError(f"{source}: no point is seen in two images, expected points that link the images")
+    if not len(rare):
+        return []
+    return [f"{len(rare)} points are seen in fewer than two images (the first is point {rare[0]}): nothing fixes them"]
+
+
+def _odd_camera(tracks: Tracks) -> list[str]:
+    """Signs that pixels and intrinsics do not belong together."""
+    if tracks.focal_length() < 10:
+        return [
+            f"the focal length is {tracks.focal_length():.3g} pixels: are the tracks in normalised coordinates? "
+            "Noise levels are stated in pixels"
+        ]
+    angle = np.degrees(np.arctan(np.nanmax(np.hypot(*np.moveaxis(tracks.normalised(), -1, 0)))))
+    if angle > 75:
+        return [f"points lie up to {angle:.0f} degrees off the camera's axis: does K belong to these pixels?"]
+    return []
+
+
+def _frames(numbers: np.ndarray) -> str:
+    """``image 3``, or ``image 3 (and 2 others)``."""
+    others = len(numbers) - 1
+    return f"image {numbers[0]}" + (f" (and {others} other{'s' if others > 1 else ''})" if others else "")
