@@ -28,6 +28,9 @@ class Evaluation:
     distance divided by sqrt(3). The extent of a frame is the largest axis-aligned side of its truth."""
     shape_error_deg: float
     """Mean angle between the truth's normals and those of a spline refitted to the aligned points, in degrees."""
+    shape_floor_deg: float
+    """Shape error of the truth itself: what the smoother refit of a reconstruction costs on this data. A reconstruction
+    cannot be expected to score below it."""
     rmse_3d: float
     """Root mean square Euclidean distance, in the unit of the truth."""
     rmse_3d_percent: float
@@ -141,6 +144,8 @@ class _Frame:
     scale: float
     shape_angle: np.ndarray
     """Degrees, of the points with a true normal."""
+    floor_angle: np.ndarray
+    """The same angles for the truth in place of the reconstruction."""
     normal_angle: np.ndarray | None
 
     @staticmethod
@@ -158,10 +163,9 @@ class _Frame:
         scale, R, t = align_similarity(points, truth)
         aligned = scale * points @ R.T + t
         over = _project(points, "reconstruction", frame) if image is None else image[held]
-        refitted = surface_normals(over, aligned, RECONSTRUCTION)
+        over_truth = _project(truth, "truth", frame) if image is None else over
         if true_normals is None:
-            over = _project(truth, "truth", frame) if image is None else over
-            reference = surface_normals(over, truth, TRUTH)
+            reference = surface_normals(over_truth, truth, TRUTH)
         else:
             reference = np.asarray(true_normals, dtype=float)[held]
         return _Frame(
@@ -169,7 +173,8 @@ class _Frame:
             extent=float(np.ptp(known_truth, axis=0).max()),
             spread=float(np.linalg.norm(truth - truth.mean(axis=0))),
             scale=scale,
-            shape_angle=_angle(refitted, reference),
+            shape_angle=_angle(surface_normals(over, aligned, RECONSTRUCTION), reference),
+            floor_angle=_angle(surface_normals(over_truth, truth, RECONSTRUCTION), reference),
             normal_angle=None if normals is None else _angle(np.asarray(normals, dtype=float)[held] @ R.T, reference),
         )
 
@@ -178,16 +183,16 @@ def _summary(frames: list[_Frame]) -> dict[str, Any]:
     """The figures of `Evaluation` over the points of some frames."""
     distance = np.concatenate([frame.distance for frame in frames])
     relative = np.concatenate([frame.distance / frame.extent for frame in frames])
-    shape = np.concatenate([frame.shape_angle for frame in frames])
     own = [frame.normal_angle for frame in frames if frame.normal_angle is not None]
     return {
         "e3d_percent": float(100 * relative.mean() / np.sqrt(3)),
-        "shape_error_deg": _mean(shape),
+        "shape_error_deg": _mean([frame.shape_angle for frame in frames]),
+        "shape_floor_deg": _mean([frame.floor_angle for frame in frames]),
         "rmse_3d": float(np.sqrt((distance**2).mean())),
         "rmse_3d_percent": float(100 * np.sqrt((relative**2).mean())),
         "median_3d_percent": float(100 * np.median(relative)),
         "frobenius_percent": float(100 * np.mean([np.linalg.norm(f.distance) / f.spread for f in frames])),
-        "normal_error_deg": _mean(np.concatenate(own)) if own else None,
+        "normal_error_deg": _mean(own) if own else None,
     }
 
 
@@ -207,7 +212,8 @@ def _angle(normals: np.ndarray, reference: np.ndarray) -> np.ndarray:
     return np.degrees(np.arctan2(sine, (normals * reference).sum(axis=-1)))
 
 
-def _mean(values: np.ndarray) -> float:
+def _mean(parts: list[np.ndarray]) -> float:
+    values = np.concatenate(parts)
     return float(values.mean()) if len(values) else float("nan")
 
 

@@ -27,6 +27,12 @@ def test_a_similar_reconstruction_has_no_error(truth: np.ndarray) -> None:
     assert result.per_frame[1]["scale"] == pytest.approx(1 / 3.0)
 
 
+def test_the_truth_scores_its_floor(truth: np.ndarray) -> None:
+    result = evaluate(2.0 * truth, truth)
+    assert result.shape_error_deg == pytest.approx(result.shape_floor_deg)
+    assert 0.0 < result.shape_floor_deg < 2.0
+
+
 def test_figures_follow_their_definitions(truth: np.ndarray) -> None:
     """A displacement that no similarity undoes: opposite normal shifts in a balanced pattern."""
     corners = np.array([[x, y, 5.0] for x in (-1.0, 0.0, 1.0) for y in (-1.0, 1.0)])
@@ -105,4 +111,5 @@ def test_truth_against_itself_leaves_only_the_refit(name: str, realdata) -> None
     data = np.load(realdata(name))
     result = evaluate(data["points"], data["points"], data["visible"])
     assert result.e3d_percent < 1e-10
+    assert result.shape_error_deg == pytest.approx(result.shape_floor_deg)
     assert result.shape_error_deg < 2.0

@@ -1,0 +1,16 @@
+"""Synthetic scenes with exact truth, and ways to spoil tracks."""
+
+from connrsfm_graph.synthetic.corruption import with_missing, with_noise, with_outliers
+from connrsfm_graph.synthetic.scene import Scene
+from connrsfm_graph.synthetic.scenes import isometric_bending, mixed, moebius, spheres
+
+__all__ = [
+    "Scene",
+    "isometric_bending",
+    "mixed",
+    "moebius",
+    "spheres",
+    "with_missing",
+    "with_noise",
+    "with_outliers",
+]
