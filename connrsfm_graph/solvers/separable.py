@@ -1,0 +1,113 @@
+"""The two schedules of the differential solve: separable steps 1 to 4, and all pair variables jointly.
+
+Separable (the paper's): with everything else frozen, each of N_t outer iterations solves
+
+    step 1   second-order terms   per point
+    step 2   first-order terms    per point
+    step 3   depth                per image, by integration
+    step 4   conformal scale      per pair, in closed form
+
+Freezing keeps every step small and well conditioned but makes the descent slow. The joint mode lets first- and
+second-order terms and scales of a point move together, which reaches the exact solution from exact warps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from connrsfm_graph.initialise import with_closed_form_scale
+from connrsfm_graph.integrate import Integrated, IntegrationConfig, balance_scales, integrate
+from connrsfm_graph.problem import Problem, State
+from connrsfm_graph.solvers.interface import Backend, Levenberg
+from factors.noise import PairNoise
+
+
+@dataclass(frozen=True)
+class SolveConfig:
+    """Differential solve with the 21-row pair factors, after the pre-step."""
+
+    schedule: Literal["joint", "separable", "none"] = "joint"
+    """All variables of a point together, the paper's steps 1 to 4, or the pre-step alone."""
+    backend: Literal["batched", "gtsam"] = "batched"
+    """Compiled executor, or per-point GTSAM graphs (slower, the same steps)."""
+    outer_iterations: int = 3
+    """N_t, rounds of steps 1 to 4; separable only."""
+    noise: PairNoise = PairNoise()
+    """Sigmas of the metric, intrinsic and extrinsic rows, and the robust threshold."""
+    levenberg: Levenberg = Levenberg()
+    """Settings of every minimisation."""
+
+
+@dataclass(frozen=True)
+class Solved:
+    """Outcome of a schedule."""
+
+    state: State
+    """First- and second-order terms, depths and scales, scales of the images balanced."""
+    integrated: Integrated
+    """The last integration."""
+    cost_history: list[float] = field(default_factory=list)
+    """Total cost of the pair factors: at the start and after every outer iteration."""
+    index_history: list[float] = field(default_factory=list)
+    """Convergence index after every outer iteration: change of the cost relative to the cost before."""
+
+
+def solve(
+    problem: Problem,
+    start: State,
+    backend: Backend,
+    config: SolveConfig,
+    integration: IntegrationConfig,
+    progress: Callable[[int, int], None] | None = None,
+) -> Solved:
+    """Run the configured schedule from the pre-step's state."""
+    if config.schedule == "separable":
+        return _separable(problem, start, backend, config, integration, progress)
+    state, costs = start, []
+    if config.schedule == "joint":
+        costs.append(total_cost(problem, state, backend, config.noise))
+        minimum = backend.minimise(problem, state, ("d", "c", "s"), config.noise, settings=config.levenberg)
+        state = minimum.state
+        costs.append(float(minimum.cost.sum()))
+    integrated = integrate(problem, state, integration)
+    state = balance_scales(problem, _with_depth(problem, state, integrated, config.noise))
+    return Solved(state, integrated, costs, _indices(costs))
+
+
+def total_cost(problem: Problem, state: State, backend: Backend, noise: PairNoise) -> float:
+    """Cost of all pair factors at a state."""
+    at_start = Levenberg(max_iterations=0)
+    return float(backend.minimise(problem, state, ("d", "c", "s"), noise, settings=at_start).cost.sum())
+
+
+def _separable(
+    problem: Problem,
+    state: State,
+    backend: Backend,
+    config: SolveConfig,
+    integration: IntegrationConfig,
+    progress: Callable[[int, int], None] | None,
+) -> Solved:
+    noise, settings = config.noise, config.levenberg
+    costs = [total_cost(problem, state, backend, noise)]
+    for iteration in range(config.outer_iterations):
+        state = backend.minimise(problem, state, ("c",), noise, settings=settings).state
+        state = backend.minimise(problem, state, ("d",), noise, settings=settings).state
+        integrated = integrate(problem, state, integration)
+        state = balance_scales(problem, _with_depth(problem, state, integrated, noise))
+        costs.append(total_cost(problem, state, backend, noise))
+        if progress is not None:
+            progress(iteration + 1, config.outer_iterations)
+    return Solved(state, integrated, costs, _indices(costs))
+
+
+def _with_depth(problem: Problem, state: State, integrated: Integrated, noise: PairNoise) -> State:
+    return with_closed_form_scale(problem, state.updated(log_depth=integrated.log_depth), noise)
+
+
+def _indices(costs: list[float]) -> list[float]:
+    return [abs(after - before) / max(before, np.finfo(float).tiny) for before, after in zip(costs, costs[1:], strict=False)]
