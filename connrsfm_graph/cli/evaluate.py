@@ -1,0 +1,78 @@
+"""Compare a result with the truth."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from connrsfm_graph.metrics import Evaluation
+    from connrsfm_graph.reconstruction import Reconstruction
+    from connrsfm_graph.tracks import Tracks
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("result", type=Path, metavar="RESULT", help="folder of a result, or its result.npz")
+    parser.add_argument("--truth", type=Path, required=True, metavar="TRACKS", help="tracks file with true points")
+    parser.add_argument("--intrinsics", metavar="K", help="camera of the truth's file, where it has none")
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
+
+
+def run(arguments: argparse.Namespace) -> None:
+    from connrsfm_graph.reconstruction import Reconstruction
+    from connrsfm_graph.tracks import load_tracks
+
+    reconstruction = Reconstruction.load(arguments.result)
+    truth = load_tracks(arguments.truth, arguments.intrinsics)
+    evaluation = evaluated(reconstruction, truth, str(arguments.truth))
+    print(json.dumps(evaluation.to_dict(), allow_nan=False) if arguments.json else table(evaluation))
+
+
+def evaluated(reconstruction: Reconstruction, truth: Tracks, source: str) -> Evaluation:
+    """Figures of a reconstruction against tracks with true points; `source` names these in messages.
+
+    Raises:
+        InputError: no true points, or those of other images or points.
+    """
+    from connrsfm_graph.errors import InputError
+    from connrsfm_graph.metrics import evaluate
+
+    if truth.points is None:
+        raise InputError(f"{source}: holds no true points; expected a field 'points' of shape (frames, points, 3)")
+    if truth.points.shape != reconstruction.points.shape:
+        sizes = [" x ".join(map(str, array.shape[:2])) for array in (truth.points, reconstruction.points)]
+        raise InputError(f"{source}: 'points' holds {sizes[0]} (frames x points), the result {sizes[1]}")
+    return evaluate(
+        reconstruction.points,
+        truth.points,
+        truth.visible,
+        normals=reconstruction.normals,
+        true_normals=truth.normals,
+    )
+
+
+def summary(evaluation: Evaluation) -> str:
+    """The figures of the field in one line."""
+    return (
+        f"3D error {evaluation.e3d_percent:.3f} %, shape error {evaluation.shape_error_deg:.2f} degrees, "
+        f"3D RMSE {evaluation.rmse_3d:.4g}, coverage {100 * evaluation.coverage:.1f} %"
+    )
+
+
+def table(evaluation: Evaluation) -> str:
+    """One row per frame and one for all."""
+    lines = [f"{'frame':>6} {'points':>7} {'e3d %':>9} {'shape deg':>10} {'RMSE 3D':>10} {'coverage %':>11}"]
+    total = {**evaluation.to_dict(), "points": sum(frame["points"] for frame in evaluation.per_frame)}
+    for name, figures in [*((str(frame["frame"]), frame) for frame in evaluation.per_frame), ("all", total)]:
+        coverage = None if figures["coverage"] is None else 100.0 * figures["coverage"]
+        lines.append(
+            f"{name:>6} {figures['points']:>7} {_cell(figures['e3d_percent'], 9, 3)} "
+            f"{_cell(figures['shape_error_deg'], 10, 2)} {_cell(figures['rmse_3d'], 10, 4)} {_cell(coverage, 11, 1)}"
+        )
+    return "\n".join(lines)
+
+
+def _cell(value: float | None, width: int, digits: int) -> str:
+    return f"{'-':>{width}}" if value is None else f"{value:>{width}.{digits}f}"

@@ -1,0 +1,105 @@
+"""Reconstruct the surface of every image from tracks."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from connrsfm_graph.cli.settings import add_configuration, resolved
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from connrsfm_graph.progress import Progress
+    from connrsfm_graph.reconstruct import Config
+    from connrsfm_graph.tracks import Tracks
+
+CONFIG_FILE = "config.toml"
+DEFAULT_METHOD = "connrsfm"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("tracks", type=Path, metavar="TRACKS", help=".npz, .mat or .csv file of point tracks")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the result")
+    parser.add_argument(
+        "--intrinsics", metavar="K", help="fx,fy,cx,cy or a text file with a 3 x 3 matrix, instead of the file's own"
+    )
+    parser.add_argument("--method", default=DEFAULT_METHOD, help="method or baseline (default: %(default)s)")
+    add_configuration(parser)
+    parser.add_argument("--no-report", action="store_true", help="write no page with pictures")
+
+
+def run(arguments: argparse.Namespace) -> None:
+    from connrsfm_graph.files import check_output_folder
+    from connrsfm_graph.progress import Progress
+    from connrsfm_graph.tracks import load_tracks
+
+    check_output_folder(arguments.out)
+    config = resolved(arguments)
+    tracks = load_tracks(arguments.tracks, arguments.intrinsics)
+    reconstruct_into(
+        arguments.out,
+        tracks,
+        str(arguments.tracks),
+        config,
+        Progress(),
+        method=arguments.method,
+        report=not arguments.no_report,
+    )
+
+
+def reconstruct_into(
+    out: Path,
+    tracks: Tracks,
+    source: str,
+    config: Config,
+    progress: Progress,
+    method: str = DEFAULT_METHOD,
+    report: bool = True,
+    images: Sequence[np.ndarray] | None = None,
+) -> None:
+    """Reconstruct, write everything into `out` and say what came of it.
+
+    The result is in place before the page is made, so an interrupted page costs no result.
+    """
+    from connrsfm_graph.config import as_toml
+    from connrsfm_graph.errors import InputError
+    from connrsfm_graph.files import folder_written_beside
+    from connrsfm_graph.reconstruct import METHODS
+    from connrsfm_graph.reconstruction import RECORD_FILE, RESULT_FILE
+    from connrsfm_graph.tracks import check_reconstructable
+
+    if method not in METHODS:
+        raise InputError(f"--method {method}: no such method, expected one of {', '.join(METHODS)}")
+    tracks, hints = check_reconstructable(tracks, source)
+    reconstruction, record = METHODS[method](tracks, config, progress)
+    warnings = tuple(dict.fromkeys((*hints, *record.warnings)))
+    record = replace(record, source=source, method=method, warnings=warnings)
+    with folder_written_beside(out) as part:
+        reconstruction.save(part / RESULT_FILE)
+        record.save(part / RECORD_FILE)
+        (part / CONFIG_FILE).write_text(as_toml(config), encoding="utf-8")
+    for warning in warnings:
+        print(f"warning: {warning}", file=sys.stderr)
+    evaluation, truth = None, tracks.points
+    if truth is not None:
+        from connrsfm_graph.cli.evaluate import evaluated, summary
+
+        try:
+            evaluation = evaluated(reconstruction, tracks, source)
+            print(summary(evaluation))
+        except InputError as error:  # the result stands, whatever is wrong with the truth
+            print(f"warning: not evaluated: {error}", file=sys.stderr)
+            truth = None
+    written = [RESULT_FILE, RECORD_FILE, CONFIG_FILE]
+    if report:
+        from connrsfm_graph.report.page import write_report
+
+        with progress.stage("report"):
+            page = write_report(out, reconstruction, record, truth, evaluation, images)
+        written.append(page.name)
+    print(f"{out}: {', '.join(written)}")
