@@ -68,6 +68,11 @@ class Surfaces:
         # The farthest few points may be gross errors that would shrink everything else.
         return np.nanquantile(shown, 0.995, axis=1).max(axis=0)
 
+    def radius(self) -> float:
+        """World units from the centre that a view from any side must show to hold every image."""
+        distance = np.linalg.norm((self.points - self.centre[:, None])[self.frames], axis=2)
+        return float(np.nanquantile(distance, 0.995, axis=1).max())
+
     def relief_range(self) -> tuple[float, float]:
         """Lower and upper end of the depth colours, common to all images."""
         return _quantiles(self.relief, 0.01, 0.99)

@@ -16,7 +16,7 @@
   };
 
   function project(points, width, height) {
-    const a = eye.right * Math.PI / 180, b = eye.up * Math.PI / 180, scale = 0.46 * Math.min(width, height * 1.15) * eye.zoom;
+    const a = eye.right * Math.PI / 180, b = eye.up * Math.PI / 180, scale = 0.46 * Math.min(width, 1.15 * height) * eye.zoom;
     const ca = Math.cos(a), sa = Math.sin(a), cb = Math.cos(b), sb = Math.sin(b);
     return points.map(p => {
       if (p === null) return null;
@@ -34,14 +34,21 @@
     const now = data.frames[+frame.value], kind = paint ? +paint.value : 0, ramp = ramps[kind];
     name.textContent = now.name;
     const p = project(now.points, width, height), values = now.values[kind];
-    const faces = now.triangles.map(t => {
+    // Normals of points are the means of their triangles' by area, so that light runs smoothly over the surface.
+    const normals = p.map(() => [0, 0, 0]);
+    for (const t of now.triangles) {
       const [a, b, c] = t.map(i => p[i]);
       const u = [b[3] - a[3], b[4] - a[4], b[2] - a[2]], v = [c[3] - a[3], c[4] - a[4], c[2] - a[2]];
       const n = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]];
+      for (const i of t) for (const k of [0, 1, 2]) normals[i][k] += n[k];
+    }
+    const faces = now.triangles.map(t => {
+      const [a, b, c] = t.map(i => p[i]);
+      const n = [0, 1, 2].map(k => t.reduce((sum, i) => sum + normals[i][k] / (Math.hypot(...normals[i]) || 1), 0));
       const sign = n[2] > 0 ? -1 : 1, length = Math.hypot(...n) || 1;
-      const lit = 0.5 + 0.5 * Math.max(0, sign * (-0.28 * n[0] - 0.50 * n[1] - 0.82 * n[2]) / length);
+      const lit = 0.45 + 0.55 * Math.max(0, sign * (-0.28 * n[0] - 0.50 * n[1] - 0.82 * n[2]) / length);
       const known = t.map(i => values[i]).filter(x => x !== null);
-      const value = known.length ? known.reduce((s, x) => s + x, 0) / known.length : null;
+      const value = known.length ? known.reduce((sum, x) => sum + x, 0) / known.length : null;
       return { a, b, c, depth: a[2] + b[2] + c[2], colour: mix(ramp, value).map(x => Math.round(x * lit)) };
     }).sort((s, t) => t.depth - s.depth);
     for (const { a, b, c, colour } of faces) {

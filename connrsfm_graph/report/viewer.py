@@ -23,7 +23,7 @@ def viewer(reconstruction: Reconstruction, surfaces: Surfaces) -> str:
         return ""
     every = -(-surfaces.points[surfaces.frames].size // MAX_NUMBERS)
     frames = surfaces.frames[::every]
-    unit = float(surfaces.reach(np.eye(3)).max())
+    unit = surfaces.radius()
     content = {
         "ramps": [DEPTH, ERROR],
         "frames": [_frame(reconstruction, surfaces, f, unit) for f in frames],
