@@ -30,7 +30,7 @@ def run(arguments: argparse.Namespace) -> None:
     config = resolved(arguments)
     progress = Progress()
     with progress.stage("render"):
-        sequence = render_sequence()
+        sequence = render_sequence(progress=progress.update)
     with folder_written_beside(out) as part:
         folder = part / IMAGES_FOLDER
         folder.mkdir()

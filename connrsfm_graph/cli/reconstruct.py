@@ -76,7 +76,10 @@ def reconstruct_into(
     if method not in METHODS:
         raise InputError(f"--method {method}: no such method, expected one of {', '.join(METHODS)}")
     tracks, hints = check_reconstructable(tracks, source)
-    reconstruction, record = METHODS[method](tracks, config, progress)
+    try:
+        reconstruction, record = METHODS[method](tracks, config, progress)
+    except InputError as error:
+        raise InputError(f"{source}: {error}") from error
     warnings = tuple(dict.fromkeys((*hints, *record.warnings)))
     record = replace(record, source=source, method=method, warnings=warnings)
     with folder_written_beside(out) as part:

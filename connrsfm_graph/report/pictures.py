@@ -94,11 +94,11 @@ class Painter:
             source_height, source_width = image.shape[:2]
             scale = min(width / source_width, height / source_height)
             small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-            # Tracks stand out on a washed-out image.
-            rgb = cv2.cvtColor(small, cv2.COLOR_GRAY2RGB) if small.ndim == 2 else small
-            pale = np.round(0.6 * rgb + 0.4 * 255).astype(np.uint8)
+            # Colours belong to the tracks, so the image is grey and pale.
+            grey = small if small.ndim == 2 else cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
+            pale = np.round(0.55 * grey + 0.45 * 255).astype(np.uint8)
             # Pixel centres are at whole coordinates in both pictures.
-            return scale, np.full(2, 0.5 * scale - 0.5), cv2.cvtColor(pale, cv2.COLOR_RGB2RGBA)
+            return scale, np.full(2, 0.5 * scale - 0.5), cv2.cvtColor(pale, cv2.COLOR_GRAY2RGBA)
         pixels = self.reconstruction.pixels
         lower, upper = np.nanmin(pixels, axis=(0, 1)), np.nanmax(pixels, axis=(0, 1))
         margin = 14.0

@@ -14,6 +14,7 @@ import pytest
 
 from connrsfm_graph.cli.main import main
 from connrsfm_graph.config import as_dict
+from connrsfm_graph.image_graph import GraphConfig, select_edges
 from connrsfm_graph.progress import Progress
 from connrsfm_graph.reconstruction import Reconstruction, RunRecord
 from connrsfm_graph.tracks import Tracks
@@ -35,9 +36,9 @@ def answer(tracks: Tracks, config: Config, progress: Progress) -> tuple[Reconstr
     """Every surface is a gentle bowl; shaped and valued as a true result would be."""
     F, P = tracks.visible.shape
     image = tracks.normalised()
+    graph = select_edges(tracks.visible, GraphConfig(), image)
     depth = 1.0 + 0.3 * (image**2).sum(axis=-1)
     points = np.concatenate([image * depth[..., None], depth[..., None]], axis=-1)
-    edges = np.array([(f, f + 1) for f in range(F - 1)])
     with progress.stage("solve"):
         reconstruction = Reconstruction(
             pixels=tracks.pixels,
@@ -48,9 +49,9 @@ def answer(tracks: Tracks, config: Config, progress: Progress) -> tuple[Reconstr
             depth=depth,
             first_order=np.zeros((F, P, 2)),
             second_order=np.zeros((F, P, 3)),
-            edges=edges,
-            edge_weight=np.ones(len(edges)),
-            conformal_scale=np.ones((len(edges), P)),
+            edges=graph.edges,
+            edge_weight=graph.weight,
+            conformal_scale=np.ones((len(graph.edges), P)),
             depth_std=np.full((F, P), np.nan),
             log_factor=np.zeros((F, P)),
             interpolated=np.zeros((F, P), bool),

@@ -51,6 +51,13 @@ def mirrored() -> dict[str, np.ndarray]:
     return fields
 
 
+def disconnected() -> dict[str, np.ndarray]:
+    fields = arrays(F=6, P=40)
+    fields["visible"][:3, 20:] = False
+    fields["visible"][3:, :20] = False
+    return fields
+
+
 def bad_focal() -> dict[str, np.ndarray]:
     return changed(K=np.diag([-500.0, 500.0, 1.0]))
 
@@ -62,6 +69,7 @@ BAD_TRACKS: list[tuple[Callable[[], dict[str, np.ndarray]], tuple[str, ...]]] = 
     (lambda: arrays(F=2), ("shows 2 images, expected at least 3",)),
     (lambda: arrays(P=3), ("holds 3 points, expected at least",)),
     (mirrored, ("image 1 shows the points mirrored",)),
+    (disconnected, ("frames 0-2; 3-5", "add tracks that link the groups")),
     (bad_focal, ("'K' has a non-positive focal length",)),
     (lambda: changed(tracks=np.zeros((4, 12, 3))), ("'tracks' has shape (4, 12, 3), expected (frames, points, 2)",)),
     (lambda: changed(tracks=np.array([[{}] * 12] * 4)), ("'tracks' holds Python objects",)),

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from connrsfm_graph.reconstruction import Reconstruction, RunRecord
+from connrsfm_graph.synthetic.rendered import RenderConfig, render_sequence
 from connrsfm_graph.tracks import load_tracks
 
 from .conftest import Ended, arrays
@@ -108,6 +109,21 @@ def test_track_follows_images(connrsfm: Run, tmp_path: Path) -> None:
     assert f"{tracks.n_points} points in 4 images" in ended.out
     motion = np.nanmedian(np.diff(tracks.pixels, axis=0), axis=(0, 1))
     np.testing.assert_allclose(motion, [-3, 0], atol=0.1)
+
+
+def test_demo_makes_everything_itself(connrsfm: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    small = RenderConfig(frames=4, width=320, height=240, focal=310)
+    monkeypatch.setattr(
+        "connrsfm_graph.synthetic.rendered.render_sequence", lambda progress: render_sequence(small, progress)
+    )
+    ended = connrsfm("demo", "--out", tmp_path / "demo")
+    assert ended.status == 0, ended.err
+    assert "3D error" in ended.out
+    tracks = load_tracks(tmp_path / "demo" / "tracks.npz")
+    assert tracks.points is not None
+    assert tracks.image_names == ("000.png", "001.png", "002.png", "003.png")
+    assert len(list((tmp_path / "demo" / "images").iterdir())) == 4
+    assert "0000_tracks.png" in {path.name for path in (tmp_path / "demo" / "pictures").iterdir()}
 
 
 def test_interrupted_run_leaves_nothing(connrsfm: Run, tracks_file: Path, tmp_path: Path) -> None:
