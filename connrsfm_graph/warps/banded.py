@@ -87,15 +87,23 @@ def inverse_in_band(lower: np.ndarray) -> np.ndarray:
     return inverse
 
 
-def patch_blocks(band: np.ndarray, first: np.ndarray, patch: np.ndarray) -> np.ndarray:
+@njit(cache=True)
+def patch_blocks(band: np.ndarray, first: np.ndarray, n: int) -> np.ndarray:
     """(P, 32, 32) blocks of a symmetric band matrix that belong to the 16 control points (both components) of each row.
 
     Args:
         band: (N, b + 1).
-        first: (P,) first control points.
-        patch: (16,) offsets of the others.
+        first: (P,) first control point of each row.
+        n: control points per axis.
     """
-    local = (2 * patch[:, None] + np.arange(2)).reshape(32)
-    low = np.minimum(local[:, None], local)
-    apart = np.abs(local[:, None] - local)
-    return band[2 * first[:, None, None] + low, apart]
+    blocks = np.empty((len(first), 32, 32))
+    local = np.empty(32, np.int64)
+    for k in range(32):
+        local[k] = 2 * ((k // 8) * n + (k // 2) % 4) + k % 2
+    for p in range(len(first)):
+        for k in range(32):
+            for m in range(k + 1):
+                entry = band[2 * first[p] + local[m], local[k] - local[m]]
+                blocks[p, k, m] = entry
+                blocks[p, m, k] = entry
+    return blocks

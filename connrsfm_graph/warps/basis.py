@@ -28,7 +28,7 @@ class SplineGrid:
 
     @staticmethod
     def around(points: np.ndarray, n: int, padding: float) -> SplineGrid:
-        """The grid whose cells cover the bounding box of `points` (N, 2), widened by `padding` times its size per side."""
+        """The grid whose cells cover the bounding box of `points` (N, 2), widened by `padding` times its size."""
         low, high = points.min(axis=0), points.max(axis=0)
         # A box that is thin along one axis would make cells that no bending energy can hold.
         margin = padding * (high - low) + 0.05 * (high - low).max()

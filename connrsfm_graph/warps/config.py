@@ -14,7 +14,7 @@ MIN_POINTS = 6
 
 @dataclass(frozen=True)
 class WarpConfig:
-    """How the warp of every edge is fitted. Weights are free of units: each image's points are scaled to unit spread."""
+    """How the warp of every edge is fitted. Weights have no units: each image's points are scaled to unit spread."""
 
     model: Model = "auto"
     """`schwarzian` (the paper's spline), `bending` (the same spline with bending energy only), `gaussian_process`, or

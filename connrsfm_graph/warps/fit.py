@@ -11,7 +11,7 @@ from connrsfm_graph.errors import InputError
 from connrsfm_graph.warps.config import WarpConfig
 from connrsfm_graph.warps.fitted import FittedWarp
 from connrsfm_graph.warps.normalise import LocalCoordinates, jet_from_local
-from connrsfm_graph.warps.select import Probe, fit_points, resolve
+from connrsfm_graph.warps.select import Probe, fit_model, fit_process, resolve
 from factors.warp_jet import JET_SIZE, WarpJet
 
 # Points whose second principal spread is below this fraction of the first lie on a line.
@@ -56,8 +56,8 @@ class Warps:
     weight: np.ndarray
     """(E, P) robust weight in [0, 1], 0 where there is no warp: far below 1 for tracks the others contradict."""
     noise: np.ndarray
-    """(E,) standard deviation of a coordinate of the points of image b about the warp, normalised coordinates; it
-    holds the noise of both images and what the warp cannot follow. NaN where there is no warp."""
+    """(E,) standard deviation of a coordinate of the points of image b about the Gaussian-process warp, whichever model
+    gives the jets, normalised coordinates; it holds the noise of both images. NaN where there is no warp."""
     residual: np.ndarray
     """(E,) root mean square of a coordinate of the residuals, normalised coordinates; NaN where there is no warp."""
     reports: tuple[WarpReport, ...]
@@ -108,13 +108,14 @@ def fit_warps(
             reports.append(WarpReport(len(shared), "", problem=problem))
         else:
             local_a, local_b = LocalCoordinates.of(image[a, shared]), LocalCoordinates.of(image[b, shared])
-            points = local_a.to_local(image[a, shared])
-            warp = fit_points(config, points, local_b.to_local(image[b, shared]))
+            probe = _probe(image[a, shared], image[b, shared], config)
+            points, _, process = probe
+            warp = fit_model(config, probe)
             jet = jet_from_local(warp.jet(points, config.covariance), local_a, local_b)
             folded = np.linalg.det(jet.jacobian) <= 0.0
             report = _report(warp, folded, local_b.spread)
             reports.append(report)
-            noise[e], residual[e] = warp.noise * local_b.spread, report.residual
+            noise[e], residual[e] = process.noise * local_b.spread, report.residual
             weight[e, shared] = warp.weight
             valid[e, shared] = report.usable & ~folded
             jets.value[e, shared], jets.jacobian[e, shared] = jet.value, jet.jacobian
@@ -174,4 +175,9 @@ def _probes(image: np.ndarray, visible: np.ndarray, edges: np.ndarray, config: W
         if _problem(image[a, shared], image[b, shared], config) is None:
             fit.append((image[a, shared], image[b, shared]))
     chosen = np.unique(np.linspace(0, len(fit) - 1, min(config.probe_edges, len(fit))).round().astype(int))
-    return [tuple(LocalCoordinates.of(side).to_local(side) for side in fit[i]) for i in chosen]
+    return [_probe(fit[i][0], fit[i][1], config) for i in chosen]
+
+
+def _probe(points: np.ndarray, target: np.ndarray, config: WarpConfig) -> Probe:
+    local, local_target = LocalCoordinates.of(points).to_local(points), LocalCoordinates.of(target).to_local(target)
+    return local, local_target, fit_process(config, local, local_target)

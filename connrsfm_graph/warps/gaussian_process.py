@@ -2,9 +2,9 @@
 
     eta(x) = H(x) + c0 + C1 x + f(x),   y_p = eta(x_p) + noise,   f_l ~ GP(0, a^2 exp(-|x - x'|^2 / (2 l^2))),
 
-the same length scale l, amplitude a and noise for both coordinates, a flat prior on the affine part (which is integrated
-out: restricted likelihood). Near-planar surfaces move almost by homographies, so H leaves a smaller field to explain
-than an affine mean would; on real tracks it raises the evidence and lowers the error of predicting left-out points.
+the same length scale l, amplitude a and noise for both coordinates, a flat prior on the affine part (which is
+integrated out: restricted likelihood). Near-planar surfaces move almost by homographies, so H leaves a smaller field to
+explain than an affine mean would; on real tracks it raises the evidence and predicts left-out points better.
 
 The kernel matrix of a smooth field has few numerically non-zero directions. A pivoted Cholesky factorisation finds
 features phi with k(x, x') = phi(x) . phi(x') on the points, up to a tolerance kept far below the noise; for given l one
@@ -25,7 +25,7 @@ from factors.warp_jet import WarpJet
 
 LONGEST_SCALE = 6.0
 """Longest length scale, in units of the spread of the points: on them the field is then a low-degree polynomial."""
-_SCALES_PER_OCTAVE = 2.5
+_SCALES_PER_OCTAVE = 2
 # Noise variance over amplitude^2.
 _NOISE_RATIOS = 10.0 ** np.arange(-12.0, 2.01, 0.25)
 # Tolerance of the features, relative to amplitude^2; the fine one is needed for (nearly) noise-free points.
@@ -97,23 +97,27 @@ class GaussianProcessWarp:
         return covariance
 
 
+def length_scales(shortest: float) -> np.ndarray:
+    """(S,) length scales from the shortest to the longest, in even ratios."""
+    count = 2 + int(_SCALES_PER_OCTAVE * np.log2(max(LONGEST_SCALE / shortest, 1.0)))
+    return np.geomspace(shortest, max(LONGEST_SCALE, shortest), count)
+
+
 def fit_gaussian_process(
-    points: np.ndarray, target: np.ndarray, weight: np.ndarray, shortest_scale: float
+    points: np.ndarray, target: np.ndarray, weight: np.ndarray, scales: np.ndarray
 ) -> GaussianProcessWarp:
     """Fit with the length scale, amplitude and noise of highest restricted likelihood.
 
     Args:
         points, target: (P, 2) in image a and in image b, both of about unit spread; at least 4 points.
         weight: (P,) in (0, 1], inverse noise variances relative to the common one.
-        shortest_scale: shortest length scale to consider.
+        scales: (S,) length scales to consider.
     """
     if len(points) >= _MIN_POINTS_HOMOGRAPHY:
         homography = fit_homography(points, target, weight)
     else:
         homography = Homography(np.zeros((2, 2)), np.zeros(2), np.zeros(2))
     rest = target - homography.jet(points).value
-    count = 1 + int(np.ceil(_SCALES_PER_OCTAVE * np.log2(LONGEST_SCALE / shortest_scale)))
-    scales = np.geomspace(shortest_scale, LONGEST_SCALE, count)
     for tolerance in (_TOLERANCE, _FINE_TOLERANCE):
         best = max(
             (_Evidence.of(points, rest, weight, scale, tolerance) for scale in scales), key=lambda e: e.log_evidence
@@ -206,7 +210,7 @@ def _pivoted_cholesky(points: np.ndarray, scale: float, tolerance: float, most: 
     Greedy: the next centre is the point whose variance the features explain least, until all are within `tolerance`.
     """
     P = len(points)
-    features = np.zeros((P, most))
+    features = np.zeros((most, P))
     pivots = np.zeros(most, np.int64)
     left = np.ones(P)
     rank = 0
@@ -214,20 +218,24 @@ def _pivoted_cholesky(points: np.ndarray, scale: float, tolerance: float, most: 
         pivot = np.argmax(left)
         if left[pivot] < tolerance:
             break
-        root = np.sqrt(left[pivot])
+        row = features[rank]
         for p in range(P):
             square = (points[p, 0] - points[pivot, 0]) ** 2 + (points[p, 1] - points[pivot, 1]) ** 2
-            value = np.exp(-0.5 * square / scale**2)
-            for k in range(rank):
-                value -= features[p, k] * features[pivot, k]
-            features[p, rank] = value / root
-            left[p] -= features[p, rank] ** 2
+            row[p] = np.exp(-0.5 * square / scale**2)
         for k in range(rank):
-            features[pivots[k], rank] = 0.0
+            factor = features[k, pivot]
+            for p in range(P):
+                row[p] -= factor * features[k, p]
+        root = np.sqrt(left[pivot])
+        for p in range(P):
+            row[p] /= root
+            left[p] -= row[p] ** 2
+        for k in range(rank):
+            row[pivots[k]] = 0.0
         left[pivot] = 0.0
         pivots[rank] = pivot
         rank += 1
-    return features[:, :rank].copy(), pivots[:rank].copy()
+    return features[:rank].T.copy(), pivots[:rank].copy()
 
 
 def _kernel_derivatives(points: np.ndarray, centres: np.ndarray, scale: float) -> np.ndarray:

@@ -15,8 +15,8 @@ def estimate_pixel_noise(image: np.ndarray, visible: np.ndarray, edges: np.ndarr
     """Standard deviation of a coordinate of the tracked points, in normalised image coordinates.
 
     Gaussian-process warps of a few edges give the noise s_n of image b about the warp. It holds the noise of both
-    images, that of image a seen through the Jacobian: s_n^2 = sigma^2 (1 + |J|_F^2 / 2). The median over edges is taken.
-    For noise-free tracks the estimate is the detail that no smooth warp explains, an upper bound.
+    images, that of image a seen through the Jacobian: s_n^2 = sigma^2 (1 + |J|_F^2 / 2). The result is the median over
+    edges. For noise-free tracks it is the detail that no smooth warp explains, an upper bound.
 
     Args:
         image, visible, edges: as in `fit_warps`.

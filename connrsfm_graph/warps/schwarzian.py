@@ -24,7 +24,7 @@ from connrsfm_graph.warps.banded import times
 from connrsfm_graph.warps.basis import UU, UV, VV, SplineGrid, U, V
 from connrsfm_graph.warps.bending import bending_band, data_equations
 
-# Equation by equation: second derivative, first derivative and factor of its two products.
+# Equation by equation: second derivative, first derivative and factor of its two products (the first two have one).
 _TERMS = (
     ((UU, U, 1.0), (UU, U, 0.0)),
     ((VV, V, 1.0), (VV, V, 0.0)),
@@ -54,7 +54,7 @@ def fit_schwarzian(
     penalty: float,
     bending: float,
     start: np.ndarray,
-    max_iterations: int = 30,
+    max_steps: int = 30,
     tolerance: float = 1e-4,
 ) -> tuple[np.ndarray, np.ndarray, int]:
     """Spline of least Schwarzian penalty.
@@ -65,13 +65,13 @@ def fit_schwarzian(
         weight: (P,) non-negative.
         penalty, bending: lambda and mu.
         start: (n * n, 2) control points to start from.
-        max_iterations: Gauss-Newton steps at most.
+        max_steps: Gauss-Newton steps at most.
         tolerance: stop once a step lowers the cost by less than this fraction of it.
 
     Returns:
         control: (n * n, 2) control points.
         lower: (N, b + 1) Cholesky factor of the Gauss-Newton matrix at the solution, in band storage.
-        iterations: steps taken.
+        steps: Gauss-Newton steps taken.
     """
     fixed, right = data_equations(grid, points, target, weight)
     fixed += bending * bending_band(grid)
@@ -89,7 +89,9 @@ def fit_schwarzian(
 
     control = start.reshape(-1)
     cost, gradient, band = linearise(control)
-    for iterations in range(1, max_iterations + 1):
+    steps = 0
+    while steps < max_steps:
+        steps += 1
         factor = cholesky_banded(band.T, lower=True)
         step = cho_solve_banded((factor, True), gradient)
         for _ in range(_MAX_HALVINGS):
@@ -104,7 +106,7 @@ def fit_schwarzian(
         if converged:
             break
     lower = cholesky_banded(band.T, lower=True)
-    return control.reshape(-1, 2), np.ascontiguousarray(lower.T), iterations
+    return control.reshape(-1, 2), np.ascontiguousarray(lower.T), steps
 
 
 @njit(cache=True)

@@ -9,21 +9,19 @@ Gaussian process predicts far better are the data smooth and clean enough to sho
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
 from connrsfm_graph.warps.config import WarpConfig
-from connrsfm_graph.warps.fitted import FittedWarp, fit_robust, prediction_error
-from connrsfm_graph.warps.gaussian_process import fit_gaussian_process
+from connrsfm_graph.warps.fitted import FittedWarp, prediction_error
+from connrsfm_graph.warps.gaussian_process import GaussianProcessWarp, fit_gaussian_process, length_scales
+from connrsfm_graph.warps.robust import fit_robust
 from connrsfm_graph.warps.spline_warp import fit_spline
 
-Fit = Callable[[np.ndarray, np.ndarray, np.ndarray], FittedWarp]
-"""(points, target, weight) in local coordinates to a fitted warp."""
-Probe = tuple[np.ndarray, np.ndarray]
-"""Points and targets of one edge in local coordinates."""
+Probe = tuple[np.ndarray, np.ndarray, GaussianProcessWarp]
+"""Points and targets of one edge in local coordinates, and the Gaussian process fitted to them."""
 
 SCHWARZIAN_WEIGHTS = 10.0 ** np.arange(-0.5, -5.1, -0.5)
 BENDING_WEIGHTS = 10.0 ** np.arange(-2.0, -7.1, -0.5)
@@ -32,45 +30,46 @@ CLEAN_RATIO = 2.0
 
 
 def resolve(config: WarpConfig, probes: Sequence[Probe]) -> WarpConfig:
-    """The configuration with its model named and the weight of that model given."""
+    """The configuration with its model named and the weight of that model given; unchanged without any probe."""
+    if not probes:
+        return config
     if config.model == "auto":
-        best = replace(config, model="schwarzian", schwarzian=_best_weight(config, "schwarzian", probes))
-        process = replace(config, model="gaussian_process")
-        clean = _error(best, probes) > CLEAN_RATIO * _error(process, probes)
-        config = process if clean else replace(config, model="schwarzian")
-    if config.model in ("schwarzian", "bending") and getattr(config, config.model) is None:
-        weight = _best_weight(config, config.model, probes)
-        config = replace(config, **{config.model: weight})
+        spline, process = replace(config, model="schwarzian"), replace(config, model="gaussian_process")
+        clean = _error(_best_weight(spline, probes), probes) > CLEAN_RATIO * _error(process, probes)
+        config = process if clean else spline
+    if config.model != "gaussian_process" and getattr(config, config.model) is None:
+        config = _best_weight(config, probes)
     return config
 
 
-def fitter(config: WarpConfig) -> Fit:
-    """The fit of a resolved configuration."""
+def fit_process(config: WarpConfig, points: np.ndarray, target: np.ndarray) -> GaussianProcessWarp:
+    """The Gaussian process of one edge, in local coordinates; it also gives the weights and the noise of the points."""
+    scales = length_scales(config.shortest_scale)
+    if config.robust:
+        return fit_robust(points, target, scales)
+    return fit_gaussian_process(points, target, np.ones(len(points)), scales)
+
+
+def fit_model(config: WarpConfig, probe: Probe) -> FittedWarp:
+    """The warp of one edge by the model of a resolved configuration, with the weights the Gaussian process found."""
+    points, target, process = probe
     if config.model == "gaussian_process":
-        return partial(fit_gaussian_process, shortest_scale=config.shortest_scale)
-    return partial(
-        fit_spline,
-        control_points=config.control_points,
-        padding=config.padding,
-        **{config.model: getattr(config, config.model)},
-    )
-
-
-def fit_points(config: WarpConfig, points: np.ndarray, target: np.ndarray) -> FittedWarp:
-    """Fit one edge with a resolved configuration, in local coordinates."""
-    fit = fitter(config)
-    if not config.robust:
-        return fit(points, target, np.ones(len(points)))
-    return fit_robust(lambda weight: fit(points, target, weight), len(points))
+        return process
+    bending = config.bending if config.model == "bending" else None
+    schwarzian = config.schwarzian if config.model == "schwarzian" else None
+    return fit_spline(points, target, process.weight, config.control_points, config.padding, bending, schwarzian)
 
 
 def _error(config: WarpConfig, probes: Sequence[Probe]) -> float:
     """Geometric mean over the edges of the error of predicting left-out points."""
-    errors = [prediction_error(fit_points(config, *probe)) for probe in probes]
+    errors = [prediction_error(fit_model(config, probe)) for probe in probes]
     return float(np.exp(np.mean(np.log(np.maximum(errors, 1e-12)))))
 
 
-def _best_weight(config: WarpConfig, model: str, probes: Sequence[Probe]) -> float:
-    weights = SCHWARZIAN_WEIGHTS if model == "schwarzian" else BENDING_WEIGHTS
-    errors = [_error(replace(config, model=model, **{model: float(w)}), probes) for w in weights]
-    return float(weights[int(np.argmin(errors))])
+def _best_weight(config: WarpConfig, probes: Sequence[Probe]) -> WarpConfig:
+    """The spline configuration with the weight of its penalty that predicts best."""
+    if config.model == "schwarzian":
+        candidates = [replace(config, schwarzian=float(weight)) for weight in SCHWARZIAN_WEIGHTS]
+    else:
+        candidates = [replace(config, bending=float(weight)) for weight in BENDING_WEIGHTS]
+    return min(candidates, key=lambda candidate: _error(candidate, probes))

@@ -49,7 +49,7 @@ class SplineWarp:
     @cached_property
     def leverage(self) -> np.ndarray:
         first, rows = self.grid.rows(self.points)
-        block = patch_blocks(self.inverse, first, self.grid.patch()).reshape(-1, 16, 2, 16, 2)
+        block = patch_blocks(self.inverse, first, self.grid.n).reshape(-1, 16, 2, 16, 2)
         own = np.einsum("pk,pkcmc,pm->p", rows[:, VALUE], block, rows[:, VALUE], optimize=True) / 2.0
         return np.minimum(self.weight * own / len(self.points), 1.0 - 1e-9)
 
@@ -72,9 +72,9 @@ class SplineWarp:
             select[:, start : start + 2, :, component] = rows[:, [U, V]]
         for component, start in ((0, 4), (1, 7)):
             select[:, start : start + 3, :, component] = rows[:, [UU, UV, VV]]
-        select = select.reshape(len(points), 10, 32)
-        block = patch_blocks(self.inverse, first, self.grid.patch())
-        return self.noise**2 / len(self.points) * (select @ block @ select.swapaxes(1, 2))
+        of_control = select.reshape(len(points), 10, 32)
+        block = patch_blocks(self.inverse, first, self.grid.n)
+        return self.noise**2 / len(self.points) * (of_control @ block @ of_control.swapaxes(1, 2))
 
 
 def fit_spline(
