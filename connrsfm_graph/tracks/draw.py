@@ -13,7 +13,7 @@ _SHIFT = 4
 """Fractional bits of the drawn coordinates."""
 
 
-def draw_tracks(image: np.ndarray, tracks: Tracks, frame: int, tail: int = 10) -> np.ndarray:
+def draw_tracks(image: np.ndarray, tracks: Tracks, frame: int, tail: int = 3) -> np.ndarray:
     """Draw every point visible in a frame and where it came from.
 
     The hue of a point is its place in the image where it was first seen, so that colours are smooth where tracks are
@@ -41,5 +41,6 @@ def draw_tracks(image: np.ndarray, tracks: Tracks, frame: int, tail: int = 10) -
         fixed = np.round(path * 2**_SHIFT).astype(np.int32)
         cv2.polylines(picture, [fixed], False, colour, thick, cv2.LINE_AA, _SHIFT)
         x, y = fixed[-1].tolist()
-        cv2.circle(picture, (x, y), 2 * thick << _SHIFT, colour, -1, cv2.LINE_AA, _SHIFT)
+        for radius, shade in ((3 * thick, (20, 20, 20)), (2 * thick, colour)):
+            cv2.circle(picture, (x, y), radius << _SHIFT, shade, -1, cv2.LINE_AA, _SHIFT)
     return picture

@@ -1,33 +1,30 @@
 """From images to tracks: corners spread evenly over the surface, followed by pyramidal Lucas-Kanade.
 
-A point is followed from image to image and kept while three checks agree: followed back it returns to where it came
-from, it moves as the affinity of its neighbours says (between successive images, and since it was first seen, which
-catches slow sliding), and it stays on the object. Where tracks have thinned out new corners are taken up.
+From image to image a point is kept while three checks agree: followed back it returns to where it came from, it moves
+as the affinity of its neighbours says, and the patch around it, registered with that affinity, still looks as it did
+when the point was first seen. The registration also removes the errors that would add up from image to image. Where
+points have thinned out new corners are taken up.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import cv2
 import numpy as np
-from scipy.spatial import cKDTree
 
 from connrsfm_graph.errors import InputError
+from connrsfm_graph.tracks.corners import corners, inside, not_black
 from connrsfm_graph.tracks.images import ImageSequence, Source
+from connrsfm_graph.tracks.neighbours import local_affinity
+from connrsfm_graph.tracks.register import patches, register
 from connrsfm_graph.tracks.tracks import Tracks
 
 _BLANK = 2.0
 """Standard deviation of grey levels (0 to 255) at and below which an image shows nothing."""
-_BLACK = 8
-"""Grey level (0 to 255) up to which a large area is taken for background that was cut away."""
-_SPECK = 0.1
-"""Areas smaller than this share of the largest one are not the object."""
-_CORNER_FLOOR = 0.02
-"""Weakest corner kept, as a share of the typical (median over cells) strongest one; weaker ones are noise."""
-_LOST = 5.0
-"""A point leaves its neighbours' affinity when its residual exceeds the limit and this many times the median."""
+_MIN_CELL = 3.0
+"""Pixels; corners closer than this share their patches."""
 
 
 @dataclass(frozen=True)
@@ -36,16 +33,18 @@ class TrackingConfig:
 
     points: int = 1000
     """Cells the object is divided into; the strongest corner of each is followed."""
-    window: int = 21
+    patch: int = 21
     """Side in pixels of the patch that is compared, odd."""
     levels: int = 3
-    """Halvings of the image; the largest motion between images is about window * 2^levels / 2 pixels."""
+    """Halvings of the image; the largest motion between images is about patch * 2^levels / 2 pixels."""
     max_return_error: float = 0.7
     """Largest distance in pixels between a point and itself followed forward and back."""
     neighbours: int = 10
     """Nearest points whose affinity a point must follow."""
     max_affine_error: float = 2.0
-    """Largest distance in pixels from where that affinity puts the point."""
+    """Largest distance in pixels from where that affinity puts the point, and from where registration puts it."""
+    min_similarity: float = 0.7
+    """Least correlation of the patch with how it looked at first."""
     min_share: float = 0.5
     """Tracks seen in a smaller share of the images are dropped."""
     every: int = 1
@@ -65,8 +64,8 @@ def track_images(
         source: folder, video, or list of image files.
         intrinsics: (3, 3) pinhole intrinsics in pixels.
         config: numbers and limits.
-        masks: images like `source`, not black where the object is. Without them everything but large black areas is
-            the object.
+        masks: images like `source`, bright where the object is. Without them everything but large black areas is the
+            object.
         progress: called with the number of images done and in all.
 
     Returns:
@@ -85,84 +84,92 @@ def track_images(
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         if grey.std() <= _BLANK:
             raise InputError(f"{name}: is blank (all pixels nearly alike), expected a textured surface; leave it out")
-        shown = _not_black(grey, config.window) if mask_images is None else _masked(mask_images, name, grey.shape)
-        follower.add(grey, _inside(shown, config.window / 4), name)
+        region = not_black(grey, config.patch) if mask_images is None else _next_mask(mask_images, name, grey.shape)
+        follower.add(grey, inside(region, config.patch / 4), name)
         names.append(name)
         if progress is not None:
             progress(len(names), max(total, len(names)))
     return Tracks.checked(follower.tracks(), intrinsics, image_names=names, source="tracked images")
 
 
+@dataclass(frozen=True)
+class _Points:
+    """N points that are being followed."""
+
+    number: np.ndarray
+    """(N,) which track a point belongs to."""
+    at: np.ndarray
+    """(N, 2) float32 pixels in the latest image."""
+    affinity: np.ndarray
+    """(N, 2, 2) distortion of the patch since it was first seen."""
+    patch: np.ndarray
+    """(N, side, side) float32, as first seen."""
+
+    def and_also(self, more: _Points) -> _Points:
+        return _Points(*(np.concatenate([getattr(self, f.name), getattr(more, f.name)]) for f in fields(self)))
+
+
 class _Follower:
-    """The points followed so far; `at[i]` is where point `number[i]` is in the latest image."""
+    """The points followed so far and where they have been."""
 
     def __init__(self, config: TrackingConfig) -> None:
         self.config = config
-        self.at = np.empty((0, 2), np.float32)
-        self.number = np.empty(0, dtype=np.int64)
-        self.first_at = np.empty((0, 2), np.float32)
-        self.first_image = np.empty(0, dtype=np.int64)
-        self.history: list[tuple[np.ndarray, np.ndarray]] = []
         self.cell = 0.0
-        self.grey: np.ndarray | None = None
+        self.n_tracks = 0
+        self.grey = np.empty((0, 0), np.uint8)
+        self.points: _Points | None = None
+        self.history: list[tuple[np.ndarray, np.ndarray]] = []
 
     def add(self, grey: np.ndarray, on_object: np.ndarray, name: str) -> None:
         """Follow all points into the next image and take up new ones where there are none."""
-        if self.grey is not None:
-            self._follow(self.grey, grey, on_object)
-            if len(self.at) == 0:
+        if self.points is None:
+            self.cell = max(float(np.sqrt(np.count_nonzero(on_object) / self.config.points)), _MIN_CELL)
+            self.points = self._new(grey, corners(grey, on_object, self.cell, np.empty((0, 2))))
+            if not self.n_tracks:
+                raise InputError(f"{name}: shows no corners to follow, expected a textured surface")
+        else:
+            followed = self._followed(self.points, grey, on_object)
+            if not len(followed.at):
                 raise InputError(
                     f"{name}: none of the points of the image before is found again; is the motion too large?"
                 )
+            self.points = followed.and_also(self._new(grey, corners(grey, on_object, self.cell, followed.at)))
         self.grey = grey
-        if self.cell == 0.0:
-            self.cell = float(np.sqrt(np.count_nonzero(on_object) / self.config.points))
-        new = corners(grey, on_object, max(self.cell, 3.0), self.at)
-        if not len(new) and not len(self.at):
-            raise InputError(f"{name}: shows no corners to follow, expected a textured surface")
-        start = self.first_image.size
-        self.at = np.concatenate([self.at, new])
-        self.number = np.concatenate([self.number, np.arange(start, start + len(new))])
-        self.first_at = np.concatenate([self.first_at, new])
-        self.first_image = np.concatenate([self.first_image, np.full(len(new), len(self.history))])
-        self.history.append((self.number, self.at))
+        self.history.append((self.points.number, self.points.at))
 
     def tracks(self) -> np.ndarray:
         """(F, P, 2) pixels of the tracks that last, NaN where lost."""
-        frames = len(self.history)
-        pixels = np.full((frames, self.first_image.size, 2), np.nan)
+        n_frames = len(self.history)
+        pixels = np.full((n_frames, self.n_tracks, 2), np.nan)
         for frame, (number, at) in enumerate(self.history):
             pixels[frame, number] = at
-        lasting = np.isfinite(pixels[..., 0]).sum(axis=0) >= max(self.config.min_share * frames, min(2, frames))
+        lasting = np.isfinite(pixels[..., 0]).mean(axis=0) >= self.config.min_share
         if not lasting.any():
             raise InputError(
-                f"no track lasts {self.config.min_share:.0%} of the {frames} images, expected slower motion or a "
-                "smaller share"
+                f"no point is followed through {self.config.min_share:.0%} of the {n_frames} images, expected slower "
+                "motion or a smaller share"
             )
         return pixels[:, lasting]
 
-    def _follow(self, before: np.ndarray, after: np.ndarray, on_object: np.ndarray) -> None:
-        config = self.config
-        there, found = _lucas_kanade(before, after, self.at, config)
-        back, returned = _lucas_kanade(after, before, there, config)
-        good = found & returned & (np.linalg.norm(back - self.at, axis=1) <= config.max_return_error)
-        height, width = on_object.shape
-        x, y = np.nan_to_num(np.rint(there), nan=-1).clip(-1, 2**30).astype(int).T
-        inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
-        good &= inside
-        good[inside] &= on_object[y[inside], x[inside]]
-        good[good] = self._with_neighbours(self.at[good], there[good])
-        for image in np.unique(self.first_image[self.number[good]]):
-            born = np.flatnonzero(good & (self.first_image[self.number] == image))
-            good[born] = self._with_neighbours(self.first_at[self.number[born]], there[born])
-        self.at, self.number = there[good], self.number[good]
+    def _new(self, grey: np.ndarray, at: np.ndarray) -> _Points:
+        number = np.arange(self.n_tracks, self.n_tracks + len(at))
+        self.n_tracks += len(at)
+        return _Points(number, at, np.tile(np.eye(2), (len(at), 1, 1)), patches(grey, at, self.config.patch))
 
-    def _with_neighbours(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-        """(N,) bool, the points that move with their neighbours; all where there are too few to say."""
-        if len(before) <= self.config.neighbours:
-            return np.ones(len(before), dtype=bool)
-        error = affine_error(before, after, self.config.neighbours)
-        return error <= max(self.config.max_affine_error, _LOST * float(np.median(error)))
+    def _followed(self, points: _Points, grey: np.ndarray, on_object: np.ndarray) -> _Points:
+        config = self.config
+        there, found = _lucas_kanade(self.grey, grey, points.at, config)
+        back, returned = _lucas_kanade(grey, self.grey, there, config)
+        good = found & returned & (np.linalg.norm(back - points.at, axis=1) <= config.max_return_error)
+        good = np.flatnonzero(good)
+        there = there[good]
+
+        step, error = local_affinity(points.at[good], there, config.neighbours)
+        at, affinity, similarity = register(points.patch[good], grey, there, step @ points.affinity[good])
+        kept = (error <= config.max_affine_error) & (similarity >= config.min_similarity)
+        kept &= (np.linalg.norm(at - there, axis=1) <= config.max_affine_error) & _within(on_object, at)
+        good = good[kept]
+        return _Points(points.number[good], at[kept].astype(np.float32), affinity[kept], points.patch[good])
 
 
 def _lucas_kanade(
@@ -174,79 +181,22 @@ def _lucas_kanade(
         after,
         points,
         points.copy(),
-        winSize=(config.window, config.window),
+        winSize=(config.patch, config.patch),
         maxLevel=config.levels,
-        criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.005),
+        criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01),
     )
     return np.asarray(there), np.asarray(found).ravel() == 1
 
 
-def corners(grey: np.ndarray, on_object: np.ndarray, cell: float, taken: np.ndarray) -> np.ndarray:
-    """The strongest corner (Shi and Tomasi's smaller eigenvalue) of every cell of the image without a point.
-
-    Args:
-        grey: (H, W) uint8.
-        on_object: (H, W) bool, where corners may lie.
-        cell: side of a cell in pixels; corners keep half of it from each other and from points already taken.
-        taken: (N, 2) pixels of the points already there.
-
-    Returns:
-        (M, 2) float32 pixels.
-    """
-    strength = np.where(on_object, cv2.cornerMinEigenVal(grey, 5), 0.0)
-    peak = cv2.dilate(strength, np.ones((3, 3), np.uint8)) == strength
-    y, x = np.nonzero(peak & (strength > 0))
-    order = np.argsort(-strength[y, x], kind="stable")
-    x, y = x[order], y[order]
-    columns = int(np.ceil(grey.shape[1] / cell))
-    index = (y // cell).astype(int) * columns + (x // cell).astype(int)
-    _, best = np.unique(index, return_index=True)  # the first of each cell is its strongest
-    if not len(best):
-        return np.empty((0, 2), np.float32)
-    best = np.sort(best)
-    best = best[strength[y[best], x[best]] >= _CORNER_FLOOR * np.median(strength[y[best], x[best]])]
-    candidates = np.column_stack([x[best], y[best]]).astype(np.float32)
-    if len(taken):
-        candidates = candidates[cKDTree(taken).query(candidates)[0] > cell]
-    if not len(candidates):
-        return candidates
-    weaker = {b for _, b in cKDTree(candidates).query_pairs(cell / 2, output_type="ndarray")}
-    return np.delete(candidates, sorted(weaker), axis=0)
+def _within(region: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """(N,) bool, the pixels (N, 2) that lie in a region (H, W)."""
+    height, width = region.shape
+    x, y = np.rint(np.clip(at, -1, max(width, height))).astype(int).T
+    in_image = (x >= 0) & (y >= 0) & (x < width) & (y < height)
+    return in_image & region[np.where(in_image, y, 0), np.where(in_image, x, 0)]
 
 
-def affine_error(before: np.ndarray, after: np.ndarray, neighbours: int) -> np.ndarray:
-    """Distance (N,) in pixels between each point and where the affinity of its nearest neighbours puts it.
-
-    The affinity from `before` to `after`, both (N, 2), is fitted by iteratively reweighted least squares (Cauchy
-    weights scaled by the median residual), so one wrong neighbour does not condemn its surroundings.
-    """
-    _, near = cKDTree(before).query(before, neighbours + 1)
-    near = near[:, 1:]
-    offset = before[near] - before[:, None]
-    scale = np.sqrt((offset**2).mean(axis=(1, 2), keepdims=True)) + 1e-9
-    design = np.concatenate([offset / scale, np.ones((*near.shape, 1))], axis=2)
-    motion = (after - before)[near].astype(np.float64)
-    weight = np.ones(near.shape)
-    for _ in range(4):
-        weighted = design * weight[..., None]
-        normal = np.einsum("nki,nkj->nij", weighted, design) + 1e-6 * neighbours * np.eye(3)
-        affinity = np.linalg.solve(normal, np.einsum("nki,nkj->nij", weighted, motion))
-        residual = np.linalg.norm(motion - design @ affinity, axis=2)
-        weight = 1 / (1 + (residual / (2 * np.median(residual, axis=1, keepdims=True) + 0.05)) ** 2)
-    return np.linalg.norm(after - before - affinity[:, 2], axis=1)
-
-
-def _not_black(grey: np.ndarray, window: int) -> np.ndarray:
-    """(H, W) bool, everything but large black areas and specks."""
-    bright = (cv2.blur(grey, (3, 3)) > _BLACK).astype(np.uint8)
-    closed = cv2.morphologyEx(bright, cv2.MORPH_CLOSE, np.ones((window, window), np.uint8))
-    _, label, statistics, _ = cv2.connectedComponentsWithStats(closed)
-    area = statistics[:, cv2.CC_STAT_AREA].astype(float)
-    area[0] = 0.0  # label 0 is the black rest
-    return np.asarray((area >= _SPECK * area.max())[label])
-
-
-def _masked(masks: Iterator[tuple[str, np.ndarray]], name: str, shape: tuple[int, ...]) -> np.ndarray:
+def _next_mask(masks: Iterator[tuple[str, np.ndarray]], name: str, shape: tuple[int, ...]) -> np.ndarray:
     """(H, W) bool, the next mask."""
     mask_name, mask = next(masks, (None, None))
     if mask_name is None or mask is None:
@@ -257,9 +207,3 @@ def _masked(masks: Iterator[tuple[str, np.ndarray]], name: str, shape: tuple[int
             f"{name}"
         )
     return np.asarray(mask.max(axis=2) > 127)
-
-
-def _inside(region: np.ndarray, margin: float) -> np.ndarray:
-    """The part of a region that is further than `margin` pixels from its border; the image's own border is none."""
-    distance = cv2.distanceTransform(region.astype(np.uint8), cv2.DIST_L2, 3)
-    return np.asarray(region & (distance > margin))

@@ -45,7 +45,9 @@ class Tracks:
         """Geometric mean of the focal lengths of all images, in pixels."""
         return float(np.exp(np.log(self.K[:, [0, 1], [0, 1]]).mean()))
 
-    def select(self, frames: Sequence[int] | slice = slice(None), points: Sequence[int] | slice = slice(None)) -> Tracks:
+    def select(
+        self, frames: Sequence[int] | slice = slice(None), points: Sequence[int] | slice = slice(None)
+    ) -> Tracks:
         """The tracks of some images and points."""
 
         def part(array: np.ndarray | None) -> np.ndarray | None:
