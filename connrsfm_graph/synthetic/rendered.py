@@ -44,7 +44,7 @@ class RenderConfig:
     focal: float = 620.0
     """Focal length in pixels."""
     bend: float = 1.0
-    """Strength of the bending; at 1 the sheet's ends turn by up to about 60 degrees, at 0 it is a moving plane."""
+    """Strength of the bending; at 1 the sheet's ends turn by up to about 80 degrees to each other, at 0 it is a moving plane."""
     noise: float = 1.0
     """Standard deviation of the image noise in grey levels."""
     seed: int = 0
@@ -174,7 +174,7 @@ def _posed(time: float, config: RenderConfig) -> BentSheet:
     angle = 0.5 * swing(0.6, 0.05)
     arc = np.linspace(-1.0, 1.0, 801)
     curvature = config.bend * (
-        1.1 * swing(0.8, 0.0) - 0.2 + 1.0 * np.sin(2 * np.pi * (arc - 0.5 * time)) * swing(0.5, 0.2)
+        0.9 * swing(0.8, 0.0) - 0.3 + 0.9 * np.sin(2 * np.pi * (arc - 0.5 * time)) * swing(0.5, 0.2)
     )
     turn = CubicSpline(arc, curvature).antiderivative()
     heading = turn(arc) - turn(0.0)
@@ -182,9 +182,9 @@ def _posed(time: float, config: RenderConfig) -> BentSheet:
     middle = profile(0.0)
     profile = CubicSpline(arc, profile(arc) - middle)
     rotation = Rotation.from_euler(
-        "yxz", [0.3 * swing(0.9, 0.55), 0.25 * swing(0.7, 0.3), 0.15 * swing(0.5, 0.1)]
+        "yxz", [0.3 * swing(0.9, 0.55), 0.2 * swing(0.7, 0.3), 0.15 * swing(0.5, 0.1)]
     ).as_matrix()
-    translation = np.array([0.06 * swing(0.7, 0.0), 0.04 * swing(1.1, 0.25), 1.32 + 0.1 * swing(0.6, 0.6)])
+    translation = np.array([0.06 * swing(0.7, 0.0), 0.025 + 0.02 * swing(1.1, 0.25), 1.37 + 0.1 * swing(0.6, 0.6)])
     return BentSheet(np.array([np.cos(angle), np.sin(angle)]), profile, rotation, translation)
 
 

@@ -44,12 +44,15 @@ def test_every_pixel_shows_the_point_its_depth_and_sheet_coordinates_say(sequenc
 
 def test_sheet_does_not_stretch_but_bends(sequence: RenderedSequence) -> None:
     grid = np.random.default_rng(0).uniform(-0.35, 0.35, (200, 2))
+    bends = []
     for surface in sequence.surfaces:
         _, by_a, by_b = surface.surface(grid)
         metric = np.stack([(by_a**2).sum(-1), (by_a * by_b).sum(-1), (by_b**2).sum(-1)])
         np.testing.assert_allclose(metric, np.array([1, 0, 1])[:, None] * np.ones(200), atol=1e-6)
         normal = np.cross(by_a, by_b)
-        assert np.degrees(np.arccos(np.clip(normal @ normal.T, -1, 1).min())) > 10
+        bends.append(np.degrees(np.arccos(np.clip(normal @ normal.T, -1, 1).min())))
+    assert min(bends) > 5
+    assert max(bends) > 40
 
 
 def test_derivatives_of_the_surface() -> None:
