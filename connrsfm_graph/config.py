@@ -104,12 +104,16 @@ def as_toml(config: Any) -> str:
 
 
 def setting_help(cls: type) -> dict[str, str]:
-    """The docstring under each field of a dataclass, by field name; fields without one are absent."""
+    """The docstring under each field of a dataclass, by field name; without one, or without its source, it is absent."""
     found: dict[str, str] = {}
     for base in reversed(cls.__mro__):
         if not is_dataclass(base):
             continue
-        body = ast.parse(textwrap.dedent(inspect.getsource(base))).body[0]
+        try:
+            source = inspect.getsource(base)
+        except OSError:  # defined interactively, or shipped without source
+            continue
+        body = ast.parse(textwrap.dedent(source)).body[0]
         assert isinstance(body, ast.ClassDef)
         for item, text in zip(body.body, body.body[1:], strict=False):
             if not (isinstance(item, ast.AnnAssign) and isinstance(item.target, ast.Name)):

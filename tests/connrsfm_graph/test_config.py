@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, make_dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -144,3 +144,9 @@ def test_written_configuration_reads_back(config: Outer) -> None:
 def test_help_is_the_string_below_the_field() -> None:
     assert setting_help(Inner) == {"iterations": "How often.", "backend": "Who computes;\ntwo lines."}
     assert "# Who computes; two lines.\nbackend" in as_toml(Outer())
+
+
+def test_settings_without_source_have_no_help_but_work() -> None:
+    made = make_dataclass("Made", [("weight", float, field(default=0.5))], frozen=True)()
+    assert setting_help(type(made)) == {}
+    assert as_toml(override(made, ["weight=2"])) == "weight = 2.0\n"
