@@ -104,7 +104,7 @@ def as_toml(config: Any) -> str:
 
 
 def setting_help(cls: type) -> dict[str, str]:
-    """The docstring under each field of a dataclass, by field name; without one, or without its source, it is absent."""
+    """The docstring under each field of a dataclass, by field name; absent where it has none or its source is gone."""
     found: dict[str, str] = {}
     for base in reversed(cls.__mro__):
         if not is_dataclass(base):
