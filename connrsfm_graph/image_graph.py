@@ -53,6 +53,14 @@ class GraphConfig:
     """In longer sequences the candidates of an image are this many images that share most tracks with it, and those
     1, 2, 4, 8, ... images away; doubled until they link all images, if the complete graph does."""
 
+    def __post_init__(self) -> None:
+        if self.min_shared < 3:
+            raise ValueError(f"min_shared is {self.min_shared}, expected 3 or more")
+        if self.neighbours < 1:
+            raise ValueError(f"neighbours is {self.neighbours}, expected 1 or more")
+        if self.extra_per_frame < 0 or (self.extra_edges is not None and self.extra_edges < 0):
+            raise ValueError("the number of extra edges is negative, expected 0 or more")
+
 
 @dataclass(frozen=True)
 class ImageGraph:

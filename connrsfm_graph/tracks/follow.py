@@ -50,6 +50,15 @@ class TrackingConfig:
     every: int = 1
     """Use every n-th image."""
 
+    def __post_init__(self) -> None:
+        if self.patch < 5 or self.patch % 2 == 0:
+            raise ValueError(f"patch is {self.patch}, expected an odd number from 5")
+        if not 0 < self.min_share <= 1:
+            raise ValueError(f"min_share is {self.min_share}, expected more than 0 and at most 1")
+        for name, least in (("points", 1), ("levels", 0), ("neighbours", 3), ("every", 1)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} is {getattr(self, name)}, expected {least} or more")
+
 
 def track_images(
     source: Source,

@@ -180,3 +180,11 @@ def test_long_sequences_stay_quick(full: bool) -> None:
     assert time.perf_counter() - start < 30.0
     assert len(graph.edges) == n - 1 + n // 2
     assert nx.is_connected(nx.Graph(graph.edges.tolist()))
+
+
+@pytest.mark.parametrize(
+    "chosen", [{"min_shared": 0}, {"neighbours": 0}, {"extra_per_frame": -1.0}, {"extra_edges": -1}]
+)
+def test_impossible_settings_are_named(chosen: dict) -> None:
+    with pytest.raises(ValueError, match="expected"):
+        GraphConfig(**chosen)

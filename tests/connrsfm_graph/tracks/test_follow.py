@@ -186,6 +186,12 @@ def test_large_black_areas_are_not_the_object_but_dark_print_is() -> None:
     assert not not_black(np.zeros((50, 50), np.uint8), 21).any()
 
 
+@pytest.mark.parametrize("chosen", [{"patch": 20}, {"patch": 3}, {"min_share": 0.0}, {"every": 0}, {"neighbours": 2}])
+def test_impossible_settings_are_named(chosen: dict) -> None:
+    with pytest.raises(ValueError, match=f"{next(iter(chosen))} is .*expected"):
+        TrackingConfig(**chosen)
+
+
 @pytest.mark.realdata
 @pytest.mark.slow
 def test_hanging_cloth_keeps_tracks_over_all_images(realdata) -> None:
