@@ -18,8 +18,8 @@ class WarpConfig:
 
     model: Model = "auto"
     """`schwarzian` (the paper's spline), `bending` (the same spline with bending energy only), `gaussian_process`, or
-    `auto`: the Gaussian process where the data are clean enough for it to predict left-out points far better, the
-    Schwarzian spline elsewhere."""
+    `auto`: the Gaussian process where the evidence says that the points follow a smooth map, the Schwarzian spline
+    where they show detail finer than `shortest_scale`."""
     control_points: int = 10
     """Control points of the spline per axis."""
     padding: float = 0.1

@@ -111,7 +111,7 @@ def fit_gaussian_process(
     Args:
         points, target: (P, 2) in image a and in image b, both of about unit spread; at least 4 points.
         weight: (P,) in (0, 1], inverse noise variances relative to the common one.
-        scales: (S,) length scales to consider.
+        scales: (S,) increasing length scales to consider, S > 1; the best is refined between its neighbours.
     """
     if len(points) >= _MIN_POINTS_HOMOGRAPHY:
         homography = fit_homography(points, target, weight)
@@ -119,9 +119,15 @@ def fit_gaussian_process(
         homography = Homography(np.zeros((2, 2)), np.zeros(2), np.zeros(2))
     rest = target - homography.jet(points).value
     for tolerance in (_TOLERANCE, _FINE_TOLERANCE):
-        best = max(
-            (_Evidence.of(points, rest, weight, scale, tolerance) for scale in scales), key=lambda e: e.log_evidence
-        )
+
+        def best_of(candidates: np.ndarray, tolerance: float = tolerance) -> _Evidence:
+            posteriors = (_Evidence.of(points, rest, weight, float(scale), tolerance) for scale in candidates)
+            return max(posteriors, key=lambda posterior: posterior.log_evidence)
+
+        best = best_of(scales)
+        between = np.sqrt(scales[:-1] * scales[1:])
+        at = int(np.searchsorted(scales, best.scale))
+        best = max(best, best_of(between[max(at - 1, 0) : at + 1]), key=lambda posterior: posterior.log_evidence)
         if best.ratio > 1e3 * tolerance:
             break
     return best.warp(points, rest, weight, homography)

@@ -13,6 +13,8 @@ from connrsfm_graph.warps.gaussian_process import GaussianProcessWarp, fit_gauss
 
 # Beyond this many standard deviations a point loses weight: 3 in 10,000 of the good ones do.
 _CUT = 4.0
+# Errors below this fraction of the spread of the points are no wrong tracks, however exact the others.
+_LEAST_SCALE = 1e-3
 _MAX_ROUNDS = 10
 _SETTLED = 0.1
 
@@ -44,4 +46,5 @@ def robust_weights(warp: FittedWarp) -> np.ndarray:
     prediction = warp.leverage / (warp.weight * (1.0 - warp.leverage))
     error = np.linalg.norm(leave_one_out(warp), axis=1) / np.sqrt(1.0 + prediction)
     scale = np.median(error) / np.sqrt(2.0 * np.log(2.0))  # median of a Rayleigh distribution
-    return np.minimum(1.0, (_CUT * scale / np.maximum(error, 1e-300)) ** 2)
+    cut = _CUT * max(scale, _LEAST_SCALE)
+    return (cut / np.maximum(error, cut)) ** 2

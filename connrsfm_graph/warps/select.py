@@ -1,10 +1,13 @@
-"""Model and smoothing weights of a data set, chosen by how well left-out points are predicted on a few of its edges.
+"""Model and smoothing weights of a data set, chosen on a few of its edges.
 
-Predicting points is not the same as knowing second derivatives, which the reconstruction needs: a smoothing that is
-optimal for the value of a warp is too rough for its derivatives. The rule for `auto` allows for that. Where points are
-noisy or sparse, Schwarzian spline and Gaussian process, both at their best, predict about equally well, and the
-geometric prior (a warp is locally a homography) decides: the spline, with its customary strong weight. Only where the
-Gaussian process predicts far better are the data smooth and clean enough to show their second derivatives themselves.
+The weight of a penalty is the one that predicts left-out points best. That is optimal for the values of a warp, but
+reconstruction needs its second derivatives, and these ask for more smoothing: Schwarzian spline and Gaussian process
+predict points about equally well where their second derivatives differ by their own size. `auto` therefore looks first
+at the length scale that the evidence prefers. Above the shortest one allowed, the points are those of a smooth map and
+noise, and the Gaussian process finds both. At the shortest one, the points show detail too fine for it (wrinkles, wrong
+correspondences). Unless it still predicts far better than any spline, as it does for exact points, derivatives come
+from a prior then, and the geometric one, a warp is locally a homography, is better founded: the Schwarzian spline, with
+its customary strong weight.
 """
 
 from __future__ import annotations
@@ -24,9 +27,11 @@ Probe = tuple[np.ndarray, np.ndarray, GaussianProcessWarp]
 """Points and targets of one edge in local coordinates, and the Gaussian process fitted to them."""
 
 SCHWARZIAN_WEIGHTS = 10.0 ** np.arange(-0.5, -5.1, -0.5)
-BENDING_WEIGHTS = 10.0 ** np.arange(-2.0, -7.1, -0.5)
-CLEAN_RATIO = 2.0
-"""`auto` takes the Gaussian process where the best spline's prediction error is at least this many times larger."""
+BENDING_WEIGHTS = 10.0 ** np.arange(0.0, -7.1, -0.5)
+RESOLVED = 1.2
+"""Length scale over the shortest one from which it counts as resolved."""
+DECISIVE = 2.0
+"""Ratio of prediction errors that counts as far better."""
 
 
 def resolve(config: WarpConfig, probes: Sequence[Probe]) -> WarpConfig:
@@ -35,8 +40,10 @@ def resolve(config: WarpConfig, probes: Sequence[Probe]) -> WarpConfig:
         return config
     if config.model == "auto":
         spline, process = replace(config, model="schwarzian"), replace(config, model="gaussian_process")
-        clean = _error(_best_weight(spline, probes), probes) > CLEAN_RATIO * _error(process, probes)
-        config = process if clean else spline
+        typical = np.median([fitted.settings["length_scale"] for _, _, fitted in probes])
+        smooth = typical > RESOLVED * config.shortest_scale
+        exact = not smooth and _error(_best_weight(spline, probes), probes) > DECISIVE * _error(process, probes)
+        config = process if smooth or exact else spline
     if config.model != "gaussian_process" and getattr(config, config.model) is None:
         config = _best_weight(config, probes)
     return config
