@@ -22,9 +22,7 @@ def scale_smoothness_factor(
     """Log conformal factors of two neighbouring points of a view, equal up to one-dimensional `noise`."""
     if noise.dim() != 1:
         raise ValueError(f"scale smoothness: noise model has dimension {noise.dim()}, expected 1")
-    return gtsam.BetweenFactorVector(
-        key(LOG_FACTOR, point_k, view), key(LOG_FACTOR, point_i, view), np.zeros(1), noise
-    )
+    return gtsam.BetweenFactorVector(key(LOG_FACTOR, point_k, view), key(LOG_FACTOR, point_i, view), np.zeros(1), noise)
 
 
 def examples(rng: np.random.Generator) -> Iterator[Example]:

@@ -1,0 +1,5 @@
+"""Global refinement over latent edge lengths that all views share."""
+
+from connrsfm_graph.refine.stage import RefineConfig, Refined, refine
+
+__all__ = ["RefineConfig", "Refined", "refine"]

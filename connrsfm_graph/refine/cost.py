@@ -1,0 +1,237 @@
+"""The refinement's cost in one view, and its linearisation, from the kernels of `factors`.
+
+Unknowns of a view, in this order per point: log depth b, ray correction q (2) and, in conformal use, the log
+conformal factor f. Latent log lengths are shared by all views. "Lagged" quantities, the
+hinge coefficients and the ratios of arc to chord, are functions of the shape that are held fixed in its derivatives.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from factors.bending import hinge_coefficients
+from factors.edge_length import arc_offset, log_chord_kernel
+
+BENDING_CAP = 6.0
+"""A hinge's coefficients are scaled down to at most this times their median: slivers carry no curvature."""
+
+
+class Weights(NamedTuple):
+    """Inverse standard deviations. A named tuple, since compiled code takes it as it is."""
+
+    length: np.ndarray
+    """(E,) of the log length residuals."""
+    huber: float
+    """Residuals beyond this many standard deviations count linearly."""
+    bending: float
+    """Of the hinge residual; 0 switches bending off."""
+    smoothness: float
+    """Of differences of the log conformal factor over near edges."""
+    factor: float
+    """Of the log conformal factor itself; weak, it fixes the mean."""
+    unit: float
+    """Of the mean log length; it fixes the unit of length."""
+
+
+@njit(cache=True)
+def hinge_stencils(length, hinge_edges, coefficients):
+    """Coefficients (H, 4) of all hinges from the edge lengths (E,), slivers capped."""
+    size = np.empty(len(hinge_edges))
+    for h in range(len(hinge_edges)):
+        e = hinge_edges[h]
+        c = hinge_coefficients(length[e[0]], length[e[1]], length[e[2]], length[e[3]], length[e[4]])
+        size[h] = 0.0
+        for j in range(4):
+            coefficients[h, j] = c[j]
+            size[h] = max(size[h], abs(c[j]))
+    if len(size) == 0:
+        return
+    cap = BENDING_CAP * np.median(size)
+    for h in range(len(size)):
+        if size[h] > cap:
+            for j in range(4):
+                coefficients[h, j] *= cap / size[h]
+
+
+@njit(cache=True)
+def _view_cost(X, f, length, offset, correction, image_weight, edges, n_near, hinges, stencils, weights):
+    """Half the robust weighted sum of squares of one view.
+
+    Args:
+        X: (P, 3) points of the view.
+        f: (P,) log conformal factors, or (0,) in isometric use.
+        length: (E,) latent log lengths.
+        offset: (E,) log ratio of arc to chord.
+        correction: (P, 2) ray corrections.
+        image_weight: (P,) inverse standard deviation of the image points.
+        edges, n_near, hinges: the mesh.
+        stencils: (H, 4) hinge coefficients.
+        weights: see `Weights`.
+    """
+    conformal = len(f) > 0
+    total = 0.0
+    for e in range(len(edges)):
+        i, k = edges[e, 0], edges[e, 1]
+        r = log_chord_kernel(X[i, 0], X[i, 1], X[i, 2], X[k, 0], X[k, 1], X[k, 2])[0] + offset[e] - length[e]
+        if conformal:
+            r -= 0.5 * (f[i] + f[k])
+            if e < n_near:
+                total += 0.5 * (weights.smoothness * (f[i] - f[k])) ** 2
+        r = abs(r * weights.length[e])
+        total += 0.5 * r * r if r <= weights.huber else weights.huber * (r - 0.5 * weights.huber)
+    for i in range(len(X)):
+        total += 0.5 * image_weight[i] ** 2 * (correction[i, 0] ** 2 + correction[i, 1] ** 2)
+        if conformal:
+            total += 0.5 * (weights.factor * f[i]) ** 2
+    if weights.bending > 0.0:
+        for h in range(len(hinges)):
+            for a in range(3):
+                r = 0.0
+                for j in range(4):
+                    r += stencils[h, j] * X[hinges[h, j], a]
+                total += 0.5 * (weights.bending * r) ** 2
+    return total
+
+
+@njit(cache=True)
+def _linearise_view(
+    X, f, length, offset, correction, image_weight, edges, n_near, hinges, stencils, weights, envelope,
+    matrix, gradient, border, residual, inverse_variance,
+):  # fmt: skip
+    """Normal equations of one view; arguments before `envelope` as in `_view_cost`.
+
+    Args:
+        envelope: storage of the matrix (see `elimination`).
+        matrix: output (N,), lower triangle.
+        gradient: output (n,).
+        border: output (E, 2 m): derivative of each length residual by the unknowns of its two ends.
+        residual: output (E,) length residuals.
+        inverse_variance: output (E,) their weights, robust loss included.
+    """
+    conformal = len(f) > 0
+    m = 4 if conformal else 3
+    row = envelope.start[:-1] - envelope.first
+    unknown = envelope.unknown
+    matrix[:] = 0.0
+    gradient[:] = 0.0
+    at = np.empty(12, dtype=np.int64)
+    J = np.empty(12)
+    for e in range(len(edges)):
+        i, k = edges[e, 0], edges[e, 1]
+        chord = log_chord_kernel(X[i, 0], X[i, 1], X[i, 2], X[k, 0], X[k, 1], X[k, 2])
+        r = chord[0] + offset[e] - length[e]
+        for c in range(3):
+            at[c], at[m + c] = unknown[i] + c, unknown[k] + c
+            J[c], J[m + c] = chord[1 + c], chord[4 + c]
+        if conformal:
+            r -= 0.5 * (f[i] + f[k])
+            at[3], at[7] = unknown[i] + 3, unknown[k] + 3
+            J[3], J[7] = -0.5, -0.5
+            if e < n_near:
+                w = weights.smoothness**2
+                matrix[row[at[3]] + at[3]] += w
+                matrix[row[at[7]] + at[7]] += w
+                matrix[row[max(at[3], at[7])] + min(at[3], at[7])] -= w
+                gradient[at[3]] += w * (f[i] - f[k])
+                gradient[at[7]] += w * (f[k] - f[i])
+        w = weights.length[e] ** 2
+        size = abs(r) * weights.length[e]
+        if size > weights.huber:
+            w *= weights.huber / size
+        residual[e], inverse_variance[e] = r, w
+        for c in range(2 * m):
+            border[e, c] = J[c]
+        _add_row(matrix, row, gradient, at, J, 2 * m, w, r)
+    for i in range(len(X)):
+        w = image_weight[i] ** 2
+        for c in range(2):
+            n = unknown[i] + 1 + c
+            matrix[row[n] + n] += w
+            gradient[n] += w * correction[i, c]
+        if conformal:
+            n = unknown[i] + 3
+            matrix[row[n] + n] += weights.factor**2
+            gradient[n] += weights.factor**2 * f[i]
+    if weights.bending > 0.0:
+        w = weights.bending**2
+        for h in range(len(hinges)):
+            for a in range(3):
+                r = 0.0
+                n = 0
+                for j in range(4):
+                    p = hinges[h, j]
+                    r += stencils[h, j] * X[p, a]
+                    at[n], J[n] = unknown[p], stencils[h, j] * X[p, a]
+                    n += 1
+                    if a < 2:
+                        at[n], J[n] = unknown[p] + 1 + a, stencils[h, j] * X[p, 2]
+                        n += 1
+                _add_row(matrix, row, gradient, at, J, n, w, r)
+
+
+@njit(cache=True, inline="always")
+def _add_row(matrix, row, gradient, at, J, n, w, r):
+    for a in range(n):
+        gradient[at[a]] += w * r * J[a]
+        for b in range(n):
+            if at[a] >= at[b]:
+                matrix[row[at[a]] + at[b]] += w * J[a] * J[b]
+
+
+@njit(cache=True)
+def _arc_offsets(X, triangles, edges, offset):
+    """Log ratio of arc to chord of every edge of one view, from the vertex normals of its mesh."""
+    normal = np.zeros_like(X)
+    for t in range(len(triangles)):
+        i, j, k = triangles[t]
+        cross = np.cross(X[j] - X[i], X[k] - X[i])
+        normal[i] += cross
+        normal[j] += cross
+        normal[k] += cross
+    for i in range(len(X)):
+        size = np.sqrt(normal[i, 0] ** 2 + normal[i, 1] ** 2 + normal[i, 2] ** 2)
+        if size > 0.0:
+            normal[i] /= size
+    for e in range(len(edges)):
+        i, k = edges[e]
+        chord = X[k] - X[i]
+        size = np.sqrt(chord[0] ** 2 + chord[1] ** 2 + chord[2] ** 2)
+        if size > 0.0:
+            a, b = np.dot(normal[i], chord) / size, np.dot(normal[k], chord) / size
+            offset[e] = arc_offset(a, b)
+        else:
+            offset[e] = 0.0
+
+
+@njit(cache=True, nogil=True)
+def arc_offset_kernel(first, last, X, triangles, edges, offset):
+    """Log ratio of arc to chord of every edge into `offset` (F, E), for views first to last - 1."""
+    for v in range(first, last):
+        _arc_offsets(X[v], triangles, edges, offset[v])
+
+
+@njit(cache=True, nogil=True)
+def cost_kernel(
+    first, last, X, f, length, offset, correction, image_weight, edges, n_near, hinges, stencils, weights, cost
+):
+    """Cost of views first to last - 1 into `cost` (F,); arguments as in `_view_cost`, with a dimension for views."""
+    for v in range(first, last):
+        cost[v] = _view_cost(
+            X[v], f[v], length, offset[v], correction[v], image_weight[v], edges, n_near, hinges, stencils, weights
+        )
+
+
+@njit(cache=True, nogil=True)
+def linearise_kernel(
+    first, last, X, f, length, offset, correction, image_weight, edges, n_near, hinges, stencils, weights, envelope,
+    matrix, gradient, border, residual, inverse_variance,
+):  # fmt: skip
+    """Normal equations of views first to last - 1; arguments as in `_linearise_view`, with a dimension for views."""
+    for v in range(first, last):
+        _linearise_view(
+            X[v], f[v], length, offset[v], correction[v], image_weight[v], edges, n_near, hinges, stencils, weights,
+            envelope, matrix[v], gradient[v], border[v], residual[v], inverse_variance[v],
+        )  # fmt: skip

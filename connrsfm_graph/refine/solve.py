@@ -1,0 +1,216 @@
+"""Levenberg-Marquardt on the refinement's cost: all views and lengths jointly, or each view on its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from connrsfm_graph.errors import ComputationError
+from connrsfm_graph.refine.cost import Weights, arc_offset_kernel, cost_kernel, hinge_stencils, linearise_kernel
+from connrsfm_graph.refine.elimination import Envelope, Factorised, NormalEquations, make_envelope
+from connrsfm_graph.refine.mesh import Mesh
+from connrsfm_graph.refine.threads import over_views
+
+Progress = Callable[[str], None]
+
+_DAMPING = (1e-3, 1e-7, 1e6)
+"""First, smallest and largest damping."""
+_INNER_TOLERANCE = 1e-2
+"""Relative accuracy of the conjugate gradients: the step is corrected by the next iteration anyway."""
+
+
+@dataclass(frozen=True)
+class Shape:
+    """What is estimated."""
+
+    log_depth: np.ndarray
+    """(F, P)."""
+    correction: np.ndarray
+    """(F, P, 2) corrections of the sight rays, normalised coordinates."""
+    log_factor: np.ndarray
+    """(F, P) log conformal factors; (F, 0) in an isometric model."""
+    log_length: np.ndarray
+    """(E,) lengths shared by all views."""
+
+    def points(self, image: np.ndarray) -> np.ndarray:
+        """(F, P, 3) points in the camera frames, for tracked image points (F, P, 2)."""
+        depth = np.exp(self.log_depth)[..., None]
+        return np.concatenate([depth * (image + self.correction), depth], axis=-1)
+
+    def views(self, index: np.ndarray | slice) -> Shape:
+        """The shape of some views."""
+        return Shape(self.log_depth[index], self.correction[index], self.log_factor[index], self.log_length)
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """What the shape is compared with."""
+
+    image: np.ndarray
+    """(F, P, 2) image points, normalised coordinates; finite everywhere, interpolated where not seen."""
+    image_weight: np.ndarray
+    """(F, P) inverse standard deviation of the image points."""
+    mesh: Mesh
+    """Edges and hinges."""
+    weights: Weights
+    """Inverse standard deviations of the other terms."""
+
+    def envelope(self, conformal: bool) -> Envelope:
+        """Storage of the views' matrices."""
+        return make_envelope(self.mesh.order(), [self.mesh.edges, self.mesh.hinges], 4 if conformal else 3)
+
+    def views(self, index: np.ndarray | slice) -> Measurements:
+        """The measurements of some views."""
+        return replace(self, image=self.image[index], image_weight=self.image_weight[index])
+
+
+@dataclass(frozen=True)
+class Lagged:
+    """Functions of the shape that are held fixed in its derivatives."""
+
+    offset: np.ndarray
+    """(F, E) log ratio of arc to chord."""
+    stencils: np.ndarray
+    """(H, 4) coefficients of the hinges."""
+
+
+def lag(measurements: Measurements, shape: Shape) -> Lagged:
+    """Hinge coefficients and arc offsets at a shape."""
+    mesh = measurements.mesh
+    stencils = np.zeros((len(mesh.hinges), 4))
+    if measurements.weights.bending > 0.0:
+        hinge_stencils(np.exp(shape.log_length), mesh.hinge_edges, stencils)
+    points = shape.points(measurements.image)
+    offset = np.empty((len(points), len(mesh.edges)))
+    over_views(arc_offset_kernel, len(points), points, mesh.triangles, mesh.edges, offset)
+    return Lagged(offset, stencils)
+
+
+def costs(measurements: Measurements, shape: Shape, lagged: Lagged) -> np.ndarray:
+    """(F,) cost of every view: half the robust weighted sum of squares."""
+    cost = np.empty(len(shape.log_depth))
+    over_views(cost_kernel, len(cost), *_arguments(measurements, shape, lagged), cost)
+    return cost
+
+
+def linearise(
+    measurements: Measurements, shape: Shape, lagged: Lagged, envelope: Envelope
+) -> tuple[NormalEquations, np.ndarray]:
+    """Normal equations at a shape, and the length residuals (F, E)."""
+    F, _ = shape.log_depth.shape
+    n, E = len(envelope.first), len(measurements.mesh.edges)
+    matrix, gradient = np.empty((F, envelope.start[-1])), np.empty((F, n))
+    border = np.empty((F, E, 8 if shape.log_factor.size else 6))
+    residual, weight = np.empty((F, E)), np.empty((F, E))
+    arguments = _arguments(measurements, shape, lagged)
+    over_views(linearise_kernel, F, *arguments, envelope, matrix, gradient, border, residual, weight)
+    unit = measurements.weights.unit
+    equations = NormalEquations(
+        matrix=matrix,
+        gradient=gradient,
+        border=border,
+        weight=weight,
+        unit=unit,
+        length_gradient=unit**2 * shape.log_length.mean() / E - (weight * residual).sum(axis=0),
+    )
+    return equations, residual
+
+
+def _arguments(measurements: Measurements, shape: Shape, lagged: Lagged) -> tuple:
+    mesh = measurements.mesh
+    return (
+        shape.points(measurements.image),
+        shape.log_factor,
+        shape.log_length,
+        lagged.offset,
+        shape.correction,
+        measurements.image_weight,
+        mesh.edges,
+        mesh.n_near,
+        mesh.hinges,
+        lagged.stencils,
+        measurements.weights,
+    )
+
+
+def moved(shape: Shape, envelope: Envelope, views: np.ndarray, lengths: np.ndarray | float) -> Shape:
+    """The shape after a step: (F, n) of the views' unknowns and (E,) of the lengths."""
+    F, P = shape.log_depth.shape
+    step = views.reshape(F, P, -1)[:, envelope.unknown // (views.shape[1] // P)]
+    return Shape(
+        log_depth=shape.log_depth + step[..., 0],
+        correction=shape.correction + step[..., 1:3],
+        log_factor=shape.log_factor + step[..., 3] if shape.log_factor.size else shape.log_factor,
+        log_length=shape.log_length + lengths,
+    )
+
+
+def minimise(measurements: Measurements, shape: Shape, iterations: int, tolerance: float) -> tuple[Shape, list[float]]:
+    """All views and the lengths together.
+
+    Args:
+        measurements: image points, mesh and weights.
+        shape: start.
+        iterations: at most so many.
+        tolerance: stop where an iteration lowers the cost by less than this part.
+
+    Returns:
+        The shape and the cost at the start and after every iteration.
+    """
+    envelope = measurements.envelope(shape.log_factor.size > 0)
+    damping, smallest, largest = _DAMPING
+    lagged = lag(measurements, shape)
+    history = [_total(measurements, shape, lagged)]
+    for _ in range(iterations):
+        before = _total(measurements, shape, lagged)
+        equations, _ = linearise(measurements, shape, lagged, envelope)
+        while damping <= largest:
+            try:
+                factorised = Factorised(equations, envelope, measurements.mesh.edges, damping)
+                trial = moved(shape, envelope, *factorised.step(_INNER_TOLERANCE))
+                after = _total(measurements, trial, lagged)
+            except ComputationError:
+                after = np.inf
+            if after <= before:
+                break
+            damping *= 10.0
+        else:
+            break
+        damping = max(damping / 10.0, smallest)
+        shape = trial
+        lagged = lag(measurements, shape)
+        history.append(after)
+        if before - after <= tolerance * before:
+            break
+    return shape, history
+
+
+def fit_views(measurements: Measurements, shape: Shape, iterations: int) -> tuple[Shape, np.ndarray]:
+    """Each view on its own, lengths held: the shape and the (F,) costs. Views are damped independently."""
+    envelope = measurements.envelope(shape.log_factor.size > 0)
+    damping = np.full(len(shape.log_depth), _DAMPING[0])
+    lagged = lag(measurements, shape)
+    for _ in range(iterations):
+        before = costs(measurements, shape, lagged)
+        equations, _ = linearise(measurements, shape, lagged, envelope)
+        factorised = Factorised(equations, envelope, measurements.mesh.edges, damping)
+        trial = moved(shape, envelope, -factorised.solve_views(equations.gradient), 0.0)
+        better = costs(measurements, trial, lagged) <= before
+        keep = better[:, None]
+        shape = Shape(
+            np.where(keep, trial.log_depth, shape.log_depth),
+            np.where(keep[..., None], trial.correction, shape.correction),
+            np.where(keep, trial.log_factor, shape.log_factor),
+            shape.log_length,
+        )
+        damping = np.clip(np.where(better, damping / 10.0, damping * 10.0), _DAMPING[1], _DAMPING[2])
+        lagged = lag(measurements, shape)
+    return shape, costs(measurements, shape, lagged)
+
+
+def _total(measurements: Measurements, shape: Shape, lagged: Lagged) -> float:
+    with np.errstate(over="ignore", invalid="ignore"):
+        total = float(costs(measurements, shape, lagged).sum())
+    return total + 0.5 * (measurements.weights.unit * float(shape.log_length.mean())) ** 2

@@ -1,0 +1,31 @@
+"""Views shared out among threads: compiled kernels that release the interpreter, called on ranges of views."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from typing import Any
+
+import numba
+
+
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, thread_name_prefix="views")
+
+
+def over_views(kernel: Callable[..., None], n_views: int, *arguments: Any) -> None:
+    """Call kernel(first, last, *arguments) on ranges that cover all views, one range per thread.
+
+    The kernel writes into its arguments, each view's part separately, so the result does not depend on the number of
+    threads, which is numba's (`NUMBA_NUM_THREADS`).
+    """
+    threads = max(1, min(n_views, numba.get_num_threads()))
+    if threads == 1:
+        kernel(0, n_views, *arguments)
+        return
+    bounds = [n_views * n // threads for n in range(threads + 1)]
+    tasks = [_pool(threads).submit(kernel, a, b, *arguments) for a, b in zip(bounds, bounds[1:], strict=False)]
+    for task in tasks:
+        task.result()
