@@ -19,12 +19,12 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
+from scipy.linalg import cholesky, eigh, solve_triangular
 from scipy.spatial import Delaunay
-from scipy.linalg import cho_solve, cholesky, eigh, solve_triangular
 
 from connrsfm_graph.errors import ComputationError
 from connrsfm_graph.problem import Problem, State
-from connrsfm_graph.warps.basis import UU, UV, VV, SplineGrid, U, V
+from connrsfm_graph.warps.basis import UU, UV, VALUE, VV, SplineGrid, U, V
 from factors.depth_gradient import depth_graph, solve_depth
 from factors.surface import Camera
 
@@ -86,8 +86,20 @@ def integrate(
     if config.method == "graph":
         return _integrate_graph(problem, state, known)
     weight = np.where(known, 1.0 if weight is None else weight, 0.0)
-    frames = range(problem.n_frames)
-    systems = [_GradientSystem(problem, state, j, weight[:, j], config) for j in frames]
+    systems = []
+    for j in range(problem.n_frames):
+        used, seen = weight[:, j] > 0, problem.visible[:, j]
+        systems.append(
+            SurfaceSpline(
+                problem.image[used, j],
+                (U, V),
+                state.first_order[used, j],
+                weight[used, j],
+                problem.image[seen, j],
+                config.control_points,
+                problem.camera,
+            )
+        )
     bending = choose_bending(systems) if config.bending is None else config.bending
     for _ in range(3 if np.isfinite(config.huber) else 0):
         spread = 1.4826 * np.median(np.concatenate([system.residual_norms(bending) for system in systems]))
@@ -97,7 +109,8 @@ def integrate(
     first, second = np.zeros((*log_depth.shape, 2)), np.zeros((*log_depth.shape, 3))
     for j, system in enumerate(systems):
         seen = problem.visible[:, j]
-        log_depth[seen, j], first[seen, j], second[seen, j] = system.surface(problem.image[seen, j], bending)
+        depth, first[seen, j], second[seen, j] = system.surface(problem.image[seen, j], bending)
+        log_depth[seen, j] = depth - depth.mean()
     return Integrated(log_depth, first, second, bending)
 
 
@@ -109,41 +122,51 @@ class _Spectrum(NamedTuple):
     right: np.ndarray
 
 
-class _GradientSystem:
-    """Spline of one image whose gradient fits the first-order terms."""
+class SurfaceSpline:
+    """Spline over one image that fits log depth or its gradient at the image's points, for any bending weight.
 
-    def __init__(self, problem: Problem, state: State, frame: int, weight: np.ndarray, config: IntegrationConfig):
-        used = weight > 0
-        self.image = problem.image[used, frame]
-        self.terms = state.first_order[used, frame]
-        self.weight = weight[used]
-        self.camera = problem.camera
-        n = int(np.clip(3 + np.ceil(np.sqrt(used.sum())), 5, config.control_points))
-        self.grid = SplineGrid.around(problem.image[problem.visible[:, frame], frame], n, PADDING)
-        self.extent = float(np.sqrt(self.grid.area))
-        first, rows = self.grid.rows(self.image)
+    Derivatives are taken in units of the image's extent, so that the bending weight does not depend on units.
+    """
+
+    def __init__(
+        self,
+        image: np.ndarray,
+        orders: tuple[int, ...],
+        target: np.ndarray,
+        weight: np.ndarray,
+        cover: np.ndarray,
+        control_points: int,
+        camera: Camera,
+    ):
+        """Fit derivatives `orders` to `target` (N, len(orders)) at `image` (N, 2), on a grid that covers `cover`."""
+        self.weight = weight
+        self.camera = camera
+        n = int(np.clip(3 + np.ceil(np.sqrt(len(image))), 5, control_points))
+        self.grid = SplineGrid.around(cover, n, PADDING)
+        extent = float(np.sqrt(self.grid.area))
+        unit = np.array([extent if order in (U, V) else 1.0 for order in orders])
+        first, rows = self.grid.rows(image)
         self.columns = first[:, None] + self.grid.patch()
-        # Gradients in units of the image's extent, so that the bending weight does not depend on units.
-        self.rows = rows[:, (U, V)] * self.extent
-        self.target = self.terms * self.extent
-        self.bending = _bending_matrix(self.grid) * self.extent**2
-        self.robust = np.ones(len(self.weight))
+        self.rows = rows[:, orders] * unit[:, None]
+        self.target = target * unit
+        self.bending = _bending_matrix(self.grid) * extent**2
+        self.robust = np.ones(len(weight))
         self._spectrum: _Spectrum | None = None
 
     def design(self) -> np.ndarray:
-        """(2 N, n^2) dense gradient rows."""
-        N = len(self.columns)
-        A = np.zeros((N, 2, self.grid.n**2))
-        A[np.arange(N)[:, None, None], np.arange(2)[:, None], self.columns[:, None, :]] = self.rows
-        return A.reshape(2 * N, -1)
+        """(N * orders, n^2) dense rows."""
+        N, orders, _ = self.rows.shape
+        A = np.zeros((N, orders, self.grid.n**2))
+        A[np.arange(N)[:, None, None], np.arange(orders)[:, None], self.columns[:, None, :]] = self.rows
+        return A.reshape(N * orders, -1)
 
     def spectrum(self) -> _Spectrum:
         if self._spectrum is None:
             A = self.design()
-            w = np.repeat(self.weight * self.robust, 2)
+            w = self._row_weight()
             normal = A.T @ (w[:, None] * A)
             scale = np.trace(normal) / len(normal)
-            # The ridge holds the constant and the control points that no point sees; it is far below either term.
+            # The ridge holds what no point sees (the constant, distant control points); it is far below either term.
             ridge = SMOOTHINGS[0] * self.bending + 1e-10 * scale * np.eye(len(normal))
             lower = cholesky(normal + ridge, lower=True)
             gamma, vectors = eigh(
@@ -158,17 +181,15 @@ class _GradientSystem:
         s = self.spectrum()
         return s.vectors @ (s.right / (1.0 + bending * s.gamma))
 
-    def residuals(self, control: np.ndarray) -> np.ndarray:
-        """(N, 2) misfit of the gradient, in units of the extent."""
-        return np.einsum("pdk,pk->pd", self.rows, control[self.columns]) - self.target
-
     def residual_norms(self, bending: float) -> np.ndarray:
-        return np.linalg.norm(self.residuals(self.control(bending)), axis=1)
+        """(N,) misfit of every point."""
+        fitted = np.einsum("pdk,pk->pd", self.rows, self.control(bending)[self.columns])
+        return np.linalg.norm(fitted - self.target, axis=1)
 
     def score(self, bending: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
-        """Weighted residual sum of squares and effective number of parameters for each bending weight, and 2 N."""
+        """Weighted residual sum of squares and effective number of parameters for each bending weight; rows."""
         s = self.spectrum()
-        total = float((np.repeat(self.weight * self.robust, 2) * self.target.ravel() ** 2).sum())
+        total = float((self._row_weight() * self.target.ravel() ** 2).sum())
         shrink = 1.0 / (1.0 + bending[:, None] * s.gamma)
         # In the spectral basis A^T W A is the identity up to the ridge.
         rss = total - (s.right**2 * (2 * shrink - shrink**2)).sum(axis=1)
@@ -176,18 +197,51 @@ class _GradientSystem:
 
     def reweight(self, threshold: float, bending: float) -> None:
         """Huber weights from the present fit."""
-        norms = self.residual_norms(bending)
-        self.robust = np.minimum(1.0, threshold / np.maximum(norms, 1e-300))
+        self.robust = np.minimum(1.0, threshold / np.maximum(self.residual_norms(bending), 1e-300))
         self._spectrum = None
 
     def surface(self, image: np.ndarray, bending: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Log depth (mean zero), first- and second-order terms at image points."""
+        """Fitted function, first- and second-order terms of the surface at image points."""
         jet = self.grid.evaluate(self.control(bending)[:, None], image)[..., 0]
         first, second = jet[:, (U, V)], jet[:, (UU, UV, VV)]
-        return jet[:, 0] - jet[:, 0].mean(), first, _terms_of_log(first, second, self.camera)
+        return jet[:, 0], first, _terms_of_log(first, second, self.camera)
+
+    def _row_weight(self) -> np.ndarray:
+        return np.repeat(self.weight * self.robust, self.target.shape[1])
 
 
-def choose_bending(systems: list[_GradientSystem]) -> float:
+def terms_of_depth(
+    image: np.ndarray, log_depth: np.ndarray, known: np.ndarray, camera: Camera, control_points: int = 14
+) -> tuple[np.ndarray, np.ndarray]:
+    """First- (F, P, 2) and second-order terms (F, P, 3) of surfaces given by their depths, by cross-validated splines.
+
+    Args:
+        image: (F, P, 2) normalised coordinates of the surface points, finite where known.
+        log_depth: (F, P).
+        known: (F, P) bool; at least three points per image. Terms are 0 elsewhere.
+        camera: camera model.
+        control_points: of the spline per axis, at most.
+    """
+    splines = [
+        SurfaceSpline(
+            image[j, seen],
+            (VALUE,),
+            log_depth[j, seen][:, None],
+            np.ones(seen.sum()),
+            image[j, seen],
+            control_points,
+            camera,
+        )
+        for j, seen in enumerate(known)
+    ]
+    bending = choose_bending(splines)
+    first, second = np.zeros((*known.shape, 2)), np.zeros((*known.shape, 3))
+    for j, (spline, seen) in enumerate(zip(splines, known, strict=True)):
+        _, first[j, seen], second[j, seen] = spline.surface(image[j, seen], bending)
+    return first, second
+
+
+def choose_bending(systems: list[SurfaceSpline]) -> float:
     """Bending weight of least generalised cross-validation score over all images."""
     scores = [system.score(SMOOTHINGS) for system in systems]
     rss = sum(score[0] for score in scores)
@@ -211,7 +265,7 @@ def balance_scales(problem: Problem, state: State) -> State:
     incidence[np.arange(len(used)), b[used]] = -1.0
     laplacian = incidence.T @ incidence + np.full((problem.n_frames,) * 2, 1.0 / problem.n_frames)
     # Adding t_j to the log depths of image j adds t_a - t_b to the log scales of edge (a, b).
-    offset = cho_solve((cholesky(laplacian + 1e-12 * np.eye(problem.n_frames), lower=True), True), -incidence.T @ medians)
+    offset = np.linalg.lstsq(laplacian, -incidence.T @ medians)[0]
     offset -= (state.log_depth + offset)[problem.visible].mean()
     return state.updated(
         log_depth=np.where(problem.visible, state.log_depth + offset, 0.0),

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from factors.surface import PERSPECTIVE, Camera, planar_second_order
-from factors.warp_jet import PAIR_DATA_SIZE, WarpJet
+from factors.warp_jet import WarpJet
 
 
 @dataclass(frozen=True)
@@ -109,8 +109,7 @@ def make_problem(
     visible: np.ndarray,
     edges: np.ndarray,
     jets: WarpJet,
-    usable: np.ndarray,
-    edge_weight: np.ndarray | None = None,
+    weight: np.ndarray,
     camera: Camera = PERSPECTIVE,
 ) -> Problem:
     """Gather tracks and warps into a problem.
@@ -120,17 +119,15 @@ def make_problem(
         visible: (F, P) bool.
         edges: (E, 2).
         jets: warp jets with leading dimensions (E, P).
-        usable: (E, P) bool, the pair may be used.
-        edge_weight: (E,) weight of each edge's pairs; 1 by default.
+        weight: (E, P) weight of each pair, 0 where it must not be used.
         camera: camera model.
     """
     image = np.where(visible[..., None], image, 0.0)
-    usable = usable & visible[edges[:, 0]] & visible[edges[:, 1]]
+    usable = (weight > 0) & visible[edges[:, 0]] & visible[edges[:, 1]]
     data = jets.pair_data(image[edges[:, 0]], image[edges[:, 1]])
     usable &= np.isfinite(data).all(axis=-1)
     data = np.where(usable[..., None], data, 0.0)
-    assert data.shape[-1] == PAIR_DATA_SIZE
-    weight = usable * (np.ones(len(edges)) if edge_weight is None else edge_weight)[:, None]
+    weight = np.where(usable, weight, 0.0)
     return Problem(
         image=np.ascontiguousarray(image.transpose(1, 0, 2)),
         visible=np.ascontiguousarray(visible.T),
@@ -143,9 +140,7 @@ def make_problem(
 
 def flat_state(problem: Problem) -> State:
     """Fronto-parallel planes at depth 1, scale 1: all variables zero."""
-    return State(
-        np.zeros((problem.n_points, problem.n_frames, 6)), np.zeros((problem.n_points, problem.n_edges))
-    )
+    return State(np.zeros((problem.n_points, problem.n_frames, 6)), np.zeros((problem.n_points, problem.n_edges)))
 
 
 def planar_state(problem: Problem, first_order: np.ndarray) -> State:

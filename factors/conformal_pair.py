@@ -4,7 +4,7 @@ A conformal map between the surfaces of images a and b, written through the imag
 metrics and, where rotation and scale vary slowly, their connections (Chen et al. 2025):
 
     metric, 3 rows (eq. 9)             g_a - lambda^2 J^T g_b J
-    connections, 2 x 9 (Theorem 1)     J3 Lambda Gamma_k(a) Lambda^-1 - (Gamma_1(b) J_1k + Gamma_2(b) J_2k) J3 - dJ3/dx_k
+    connections, 2 x 9 (Theorem 1)     J3 Lambda Gamma_k(a) Lambda^-1 - (Gamma_l(b) J_lk) J3 - dJ3/dx_k, summed over l
 
 with J3 = diag(J, det J), Lambda = diag(lambda, lambda, lambda^2) and lambda the local size in a over that in b. Depths
 and scale enter only through rho = lambda beta_b / beta_a once the rows are written in unit-depth frames (metric
@@ -98,9 +98,10 @@ def pair_kernel(data, ya, yb, log_rho, kappa, G, dG, r, J, derivatives):
                 J[o + 3 + c, m] = j21 * dA[k, 0, c, m] + j22 * dA[k, 1, c, m]
                 J[o + 6 + c, m] = det * rho * dA[k, 2, c, m]
                 for i in range(3):
-                    J[o + 3 * i + c, 6 + m] = -(w1 * dB[0, i, 0, m] + w2 * dB[1, i, 0, m]) * jc1 - (
-                        w1 * dB[0, i, 1, m] + w2 * dB[1, i, 1, m]
-                    ) * jc2
+                    J[o + 3 * i + c, 6 + m] = (
+                        -(w1 * dB[0, i, 0, m] + w2 * dB[1, i, 0, m]) * jc1
+                        - (w1 * dB[0, i, 1, m] + w2 * dB[1, i, 1, m]) * jc2
+                    )
             J[o + 2, m] = (j11 * dA[k, 0, 2, m] + j12 * dA[k, 1, 2, m]) / rho
             J[o + 5, m] = (j21 * dA[k, 0, 2, m] + j22 * dA[k, 1, 2, m]) / rho
             J[o + 8, m] = det * dA[k, 2, 2, m]

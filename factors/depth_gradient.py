@@ -25,7 +25,11 @@ SCALE_SIGMA = 1.0
 
 
 def depth_differences(
-    image: np.ndarray, first_order: np.ndarray, second_order: np.ndarray, pairs: np.ndarray, camera: Camera = PERSPECTIVE
+    image: np.ndarray,
+    first_order: np.ndarray,
+    second_order: np.ndarray,
+    pairs: np.ndarray,
+    camera: Camera = PERSPECTIVE,
 ) -> np.ndarray:
     """Log-depth differences (N,) from pixel pairs[:, 0] to pairs[:, 1].
 
@@ -46,9 +50,7 @@ def depth_differences(
     return (slope * dx).sum(axis=-1) + ((hessian[i] - hessian[k]) * square).sum(axis=-1) / 12.0
 
 
-def depth_gradient_factor(
-    points: tuple[int, int], view: int, difference: float, sigma: float
-) -> gtsam.NonlinearFactor:
+def depth_gradient_factor(points: tuple[int, int], view: int, difference: float, sigma: float) -> gtsam.NonlinearFactor:
     """Native factor: log depth of points[1] less that of points[0] in a view."""
     first, second = (keys.key(keys.LOG_DEPTH, point, view) for point in points)
     noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma)

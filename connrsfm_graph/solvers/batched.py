@@ -50,7 +50,8 @@ def _whiten(r, rows, precision, weight, huber):
 
 
 @njit(cache=True)
-def _point_cost(model, frame, log_scale, data, weight, edges, kappa, precision, huber, workspace, r, J):
+def _point_cost(model, frame, log_scale, data, weight, edges, kappa, precision, huber, scratch):
+    workspace, r, J = scratch
     cost = 0.0
     for e in range(len(edges)):
         if weight[e] > 0.0:
@@ -63,9 +64,10 @@ def _point_cost(model, frame, log_scale, data, weight, edges, kappa, precision, 
 
 @njit(cache=True)
 def _linearise_point(
-    model, frame, log_scale, data, weight, edges, structure, columns, scaled, kappa, precision, huber, workspace, r, J, H
+    model, frame, log_scale, data, weight, edges, structure, columns, scaled, kappa, precision, huber, scratch, H
 ):
     """Normal equations of one point into H = (diagonal, lower, gradient, cross, scale, scale_gradient)."""
+    workspace, r, J = scratch
     diagonal, lower, gradient, cross, scale, scale_gradient = H
     n = len(columns)
     m = 2 * n + scaled
@@ -178,8 +180,7 @@ def _minimise_point(
     """Levenberg-Marquardt of one point in place; returns (cost, accepted steps, solvable)."""
     max_iterations, tolerance, damping = limits
     F, E, n = len(frame), len(edges), len(columns)
-    workspace = pair_workspace()
-    r, J = np.empty(ROWS), np.empty((ROWS, COLUMNS))
+    scratch = (pair_workspace(), np.empty(ROWS), np.empty((ROWS, COLUMNS)))
     blocks = len(structure.row)
     H = (
         np.empty((F, n, n)),
@@ -192,7 +193,7 @@ def _minimise_point(
     diagonal, lower = np.empty((F, n, n)), np.empty((blocks, n, n))
     step, scale_step = np.zeros((F, n)), np.zeros(E)
     trial, trial_scale = frame.copy(), log_scale.copy()
-    cost = _point_cost(model, frame, log_scale, data, weight, edges, kappa, precision, huber, workspace, r, J)
+    cost = _point_cost(model, frame, log_scale, data, weight, edges, kappa, precision, huber, scratch)
     iteration = 0
     while iteration < max_iterations and (single or cost > VANISHING_COST):
         _linearise_point(
@@ -208,9 +209,7 @@ def _minimise_point(
             kappa,
             precision,
             huber,
-            workspace,
-            r,
-            J,
+            scratch,
             H,
         )
         while True:
@@ -222,9 +221,7 @@ def _minimise_point(
                     for k in range(n):
                         trial[f, columns[k]] = frame[f, columns[k]] + step[f, k]
                 trial_scale[:] = log_scale + scale_step
-                new = _point_cost(
-                    model, trial, trial_scale, data, weight, edges, kappa, precision, huber, workspace, r, J
-                )
+                new = _point_cost(model, trial, trial_scale, data, weight, edges, kappa, precision, huber, scratch)
                 if single or new <= cost:  # false where the new cost is not a number
                     break
             damping *= 10.0

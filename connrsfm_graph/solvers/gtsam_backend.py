@@ -214,5 +214,3 @@ def _store(state: State, values: gtsam.Values) -> None:
             state.log_scale[point, second] = values.atVector(key)[0]
         else:
             state.frame[point, second, VECTORS[letter]] = values.atVector(key)
-
-

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -22,8 +23,13 @@ import numpy as np
 from connrsfm_graph.initialise import with_closed_form_scale
 from connrsfm_graph.integrate import Integrated, IntegrationConfig, balance_scales, integrate
 from connrsfm_graph.problem import Problem, State
-from connrsfm_graph.solvers.interface import Backend, Levenberg
+from connrsfm_graph.solvers.interface import Backend, Levenberg, Minimum
 from factors.noise import PairNoise
+
+JOINT = ("d", "c", "s")
+"""Active variables of the joint schedule; depths follow by integration, since pair factors do not see them."""
+RESTART_GAIN = 1e-3
+"""Relative decrease of a point's cost that counts as a better minimum."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +42,9 @@ class SolveConfig:
     """Compiled executor, or per-point GTSAM graphs (slower, the same steps)."""
     outer_iterations: int = 3
     """N_t, rounds of steps 1 to 4; separable only."""
-    noise: PairNoise = PairNoise()
+    restarts: int = 2
+    """Rounds in which points start again from the surface through all points; joint only."""
+    noise: PairNoise = PairNoise(intrinsic=10.0, extrinsic=30.0)
     """Sigmas of the metric, intrinsic and extrinsic rows, and the robust threshold."""
     levenberg: Levenberg = Levenberg()
     """Settings of every minimisation."""
@@ -70,18 +78,43 @@ def solve(
     state, costs = start, []
     if config.schedule == "joint":
         costs.append(total_cost(problem, state, backend, config.noise))
-        minimum = backend.minimise(problem, state, ("d", "c", "s"), config.noise, settings=config.levenberg)
-        state = minimum.state
+        minimum = backend.minimise(problem, state, JOINT, config.noise, settings=config.levenberg)
         costs.append(float(minimum.cost.sum()))
+        for _ in range(config.restarts):
+            minimum, improved = _restart_from_surface(problem, minimum, backend, config)
+            costs.append(float(minimum.cost.sum()))
+            if not improved:
+                break
+        state = minimum.state
     integrated = integrate(problem, state, integration)
     state = balance_scales(problem, _with_depth(problem, state, integrated, config.noise))
     return Solved(state, integrated, costs, _indices(costs))
 
 
+def _restart_from_surface(
+    problem: Problem, minimum: Minimum, backend: Backend, config: SolveConfig
+) -> tuple[Minimum, bool]:
+    """Start every point again from the surface through all points and keep the better of both minima.
+
+    A point's cost has several minima (a patch seen concave or convex); its neighbours know which is right.
+    """
+    surface = integrate(problem, minimum.state)
+    start = minimum.state.updated(first_order=surface.first_order, second_order=surface.second_order)
+    start = with_closed_form_scale(problem, start, config.noise)
+    again = backend.minimise(problem, start, JOINT, config.noise, settings=config.levenberg)
+    better = again.cost < (1.0 - RESTART_GAIN) * minimum.cost
+    frame = np.where(better[:, None, None], again.state.frame, minimum.state.frame)
+    log_scale = np.where(better[:, None], again.state.log_scale, minimum.state.log_scale)
+    kept = Minimum(
+        State(frame, log_scale), np.where(better, again.cost, minimum.cost), minimum.iterations + again.iterations
+    )
+    return kept, bool(better.any())
+
+
 def total_cost(problem: Problem, state: State, backend: Backend, noise: PairNoise) -> float:
     """Cost of all pair factors at a state."""
     at_start = Levenberg(max_iterations=0)
-    return float(backend.minimise(problem, state, ("d", "c", "s"), noise, settings=at_start).cost.sum())
+    return float(backend.minimise(problem, state, JOINT, noise, settings=at_start).cost.sum())
 
 
 def _separable(
@@ -110,4 +143,4 @@ def _with_depth(problem: Problem, state: State, integrated: Integrated, noise: P
 
 
 def _indices(costs: list[float]) -> list[float]:
-    return [abs(after - before) / max(before, np.finfo(float).tiny) for before, after in zip(costs, costs[1:], strict=False)]
+    return [abs(after - before) / max(before, np.finfo(float).tiny) for before, after in pairwise(costs)]
