@@ -53,7 +53,7 @@ def test_gaussian_process_finds_the_jets_of_most_points_of_spheres():
 
 @pytest.mark.parametrize("model", MODELS)
 def test_second_derivatives_match_finite_differences_of_the_warp(model):
-    """Extra points, seen in the first image only through their neighbours' fit, cannot be had: differ along tracks."""
+    """Jets are given at the points only, so differences are taken between points that happen to lie close together."""
     image = smooth_images(200, 1e-4)
     warps = fit_warps(image, all_visible(image), EDGES, WarpConfig(model=model, robust=False))
     order = np.lexsort(image[0].T)
