@@ -121,7 +121,7 @@ class GtsamBackend:
         for point, graph, values in _subgraphs(problem, state, active, noise, model):
             ordering = gtsam.Ordering.ColamdNonlinearFactorGraph(graph)
             try:
-                delta = _damped(graph.linearize(values), values, damping).optimize(ordering)
+                delta = damped(graph.linearize(values), values, damping).optimize(ordering)
             except RuntimeError as error:
                 raise ComputationError(
                     f"the normal equations of point {point} are not positive definite with active variables "
@@ -161,7 +161,7 @@ def levenberg_marquardt(
         linear = graph.linearize(values)
         while True:
             try:
-                trial = values.retract(_damped(linear, values, damping).optimize(ordering))
+                trial = values.retract(damped(linear, values, damping).optimize(ordering))
                 new = graph.error(trial)
             except (RuntimeError, ValueError):  # indeterminate system, or a residual that is not a number
                 new = np.inf
@@ -187,7 +187,8 @@ def _subgraphs(
             yield point, graph, values
 
 
-def _damped(linear: gtsam.GaussianFactorGraph, values: gtsam.Values, damping: float) -> gtsam.GaussianFactorGraph:
+def damped(linear: gtsam.GaussianFactorGraph, values: gtsam.Values, damping: float) -> gtsam.GaussianFactorGraph:
+    """The linear graph with `damping` added to the diagonal of its normal equations."""
     if damping == 0.0:
         return linear
     damped = gtsam.GaussianFactorGraph()
