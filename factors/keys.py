@@ -15,6 +15,7 @@ A key packs a letter (8 bits), a first index (32 bits) and a second index (24 bi
 | `t` | camera pose | 0, view | 6 |
 | `g` | log scale of a view | 0, view | 1 |
 | `m` | map point | point, view | 3 |
+| `r` | rigid landmark | landmark, 0 | 3 |
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ LOG_LENGTH = "e"
 CAMERA_POSE = "t"
 VIEW_SCALE = "g"
 MAP_POINT = "m"
+RIGID_LANDMARK = "r"
 
 _NAMES = {
     FIRST_ORDER: ("first-order terms", "point", "view"),
@@ -41,6 +43,7 @@ _NAMES = {
     CAMERA_POSE: ("camera pose", None, "view"),
     VIEW_SCALE: ("log view scale", None, "view"),
     MAP_POINT: ("map point", "point", "view"),
+    RIGID_LANDMARK: ("rigid landmark", "landmark", None),
 }
 
 _FIRST_LIMIT = 1 << 32

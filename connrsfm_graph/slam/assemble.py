@@ -1,0 +1,151 @@
+"""A reconstruction as factors in a GTSAM graph, one by one: for graphs of one's own, and the reference of the solver.
+
+What camera motion is and what deformation decides the prior on motion. It is isotropic and independent over points,
+so of all explanations of the images that differ by a motion of camera and surface together, the one in which the
+surface's points move least (in sum of squares) is the cheapest: **minimum deformation**. Every rigid landmark, prior
+or odometry factor adds its own cost to that of moving the camera, and a **rigid background decides**: its image points
+are known to a fraction of a pixel, the motion prior is worth a few per cent of the depth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import gtsam
+import numpy as np
+
+from connrsfm_graph.errors import InputError
+from connrsfm_graph.reconstruction import Reconstruction
+from connrsfm_graph.slam.sightings import FusionNoise, Sightings, estimate_noise
+from factors.camera_anchor import camera_anchor_factor
+from factors.keys import CAMERA_POSE, LOG_DEPTH, MAP_POINT, VIEW_SCALE, describe, key
+from factors.map_motion import map_motion_factor
+from factors.scale_link import scale_link_factor
+
+
+@dataclass(frozen=True)
+class MapModel:
+    """How a reconstruction is tied to the world."""
+
+    motion: Literal["position", "velocity"] = "position"
+    """What changes little from view to view: the place of a map point, or its velocity."""
+    huber: float = 3.0
+    """Anchors beyond this many standard deviations of the image noise count linearly."""
+
+    def __post_init__(self) -> None:
+        if self.motion not in ("position", "velocity"):
+            raise InputError(f"fusion motion is '{self.motion}', expected position or velocity")
+        if not self.huber > 0:
+            raise InputError(f"fusion huber is {self.huber}, expected a positive number")
+
+    @property
+    def window(self) -> int:
+        """Sightings of a point that one motion factor spans."""
+        return 2 if self.motion == "position" else 3
+
+    def anchor_noise(self, sigma: float) -> gtsam.noiseModel.Base:
+        """GTSAM's noise model of an anchor."""
+        loss = gtsam.noiseModel.mEstimator.Huber.Create(self.huber)
+        return gtsam.noiseModel.Robust.Create(loss, gtsam.noiseModel.Isotropic.Sigma(3, sigma))
+
+
+def pose_key(view: int) -> int:
+    """Key of a camera's pose in this package's numbering."""
+    return key(CAMERA_POSE, 0, view)
+
+
+def add_reconstruction(
+    graph: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
+    reconstruction: Reconstruction | Sightings,
+    noise: FusionNoise | None = None,
+    model: MapModel | None = None,
+    pose_key: Callable[[int], int] = pose_key,
+) -> None:
+    """Extend a graph by a reconstruction: anchors, depths, motion of the map and links between the views' scales.
+
+    Adds to `values` the log depth and the map point of every sighting, and the log scale of every view that has none
+    yet. The camera poses must be there; scales start at 0 unless given. Graph and values stay the caller's, and fit any
+    optimiser (drive it as `solvers.gtsam_backend.levenberg_marquardt` does: GTSAM's own copy the values in every call).
+
+    Args:
+        graph, values: extended in place, and only if nothing is wrong.
+        reconstruction: surfaces in camera frames.
+        noise: noise levels; estimated from the reconstruction where None.
+        model: how the map moves.
+        pose_key: key of the pose (`gtsam.Pose3`, camera to world) of a view.
+
+    Raises:
+        InputError: a pose is missing, or a variable is in `values` already.
+    """
+    sightings = reconstruction if isinstance(reconstruction, Sightings) else Sightings.of(reconstruction)
+    noise = noise or estimate_noise(sightings)
+    model = model or MapModel()
+    views = np.flatnonzero(sightings.seen.any(axis=1))
+    new_values = gtsam.Values()
+    for view in views:
+        if not values.exists(pose_key(int(view))):
+            raise InputError(f"view {view}: no {describe(pose_key(int(view)))} among the values; insert a Pose3 for it")
+        g = key(VIEW_SCALE, 0, int(view))
+        if not values.exists(g):
+            new_values.insert(g, np.zeros(1))
+    new_graph = gtsam.NonlinearFactorGraph()
+    for view in views:
+        g = key(VIEW_SCALE, 0, int(view))
+        scale = float((values if values.exists(g) else new_values).atVector(g)[0])
+        add_sightings(new_graph, new_values, sightings, int(view), values.atPose3(pose_key(int(view))), scale, noise, model, pose_key(int(view)))
+    for point in range(sightings.n_points):
+        seen = np.flatnonzero(sightings.seen[:, point])
+        for start in range(len(seen) - model.window + 1):
+            new_graph.add(map_motion_factor(point, seen[start : start + model.window].tolist(), noise.motion))
+    for a, b in zip(views[:-1].tolist(), views[1:].tolist(), strict=True):
+        new_graph.add(link_scales(a, b, noise))
+    taken = [k for k in new_values.keys() if values.exists(k)]
+    if taken:
+        raise InputError(f"{describe(taken[0])} is among the values already; a reconstruction is added once")
+    graph.push_back(new_graph)
+    values.insert(new_values)
+
+
+def add_sightings(
+    graph: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
+    sightings: Sightings,
+    row: int,
+    pose: gtsam.Pose3,
+    log_scale: float,
+    noise: FusionNoise,
+    model: MapModel,
+    pose_key: int,
+    view: int | None = None,
+) -> None:
+    """Anchors and depths of one view, its map points starting where pose, scale and depths put them.
+
+    Args:
+        graph, values: extended in place.
+        sightings, row: which view of which sightings.
+        pose, log_scale: of the camera, to start from.
+        noise, model: as in `add_reconstruction`.
+        pose_key: key of the pose.
+        view: index of the view in the keys; `row` where None.
+    """
+    view = row if view is None else view
+    anchor_noise = model.anchor_noise(noise.image)
+    (points,) = np.nonzero(sightings.seen[row])
+    world = pose.transformFrom(np.exp(log_scale) * sightings.points()[row, points].T).T
+    for point, start in zip(points.tolist(), world, strict=True):
+        b, m = key(LOG_DEPTH, point, view), key(MAP_POINT, point, view)
+        log_depth = sightings.log_depth[row, point : point + 1]
+        own = sightings.depth_std[row, point]
+        sigma = gtsam.noiseModel.Isotropic.Sigma(1, noise.depth if np.isnan(own) else float(own))
+        graph.add(camera_anchor_factor(point, view, sightings.image[row, point], anchor_noise, pose_key=pose_key))
+        graph.add(gtsam.PriorFactorVector(b, log_depth, sigma))
+        values.insert(b, log_depth)
+        values.insert(m, start)
+
+
+def link_scales(a: int, b: int, noise: FusionNoise) -> gtsam.NonlinearFactor:
+    """The scales of two views differ by a random walk over the views between them."""
+    return scale_link_factor((a, b), gtsam.noiseModel.Isotropic.Sigma(1, noise.scale * (b - a) ** 0.5))

@@ -1,0 +1,234 @@
+"""Anchors, depths and motions of a whole map at once: linearised in batch and eliminated onto the cameras.
+
+The same cost as the factors of `assemble`, point by point. The log depth of a sighting is in one anchor and one prior
+and is eliminated first; what is left of the point is a chain of map points with a banded matrix A, whose couplings E to
+the cameras reach only the camera of each sighting and the scales of its neighbours. The cameras' normal equations get
+-E^T A^-1 E. Seven columns per camera, pose and log scale; dense, since every point couples all views that see it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from scipy.linalg import cho_solve_banded, cholesky_banded
+
+from connrsfm_graph.slam.assemble import MapModel
+from connrsfm_graph.slam.sightings import FusionNoise, Sightings
+from factors.camera_anchor import DEPTH, POINT, linearise_anchors
+from factors.map_motion import motion_coefficients, motion_variance, scale_view
+
+CAMERA = 7
+"""Columns of a camera: pose (6), log scale (1)."""
+_COUPLED = 9
+"""Columns a map point is coupled to: its own camera, the scale of the sighting before and of the one after."""
+
+
+@dataclass(frozen=True)
+class MapState:
+    """Cameras and map. One row per sighting, point by point and in order of views."""
+
+    R: np.ndarray
+    """(F, 3, 3) camera to world."""
+    t: np.ndarray
+    """(F, 3) camera centres in the world."""
+    g: np.ndarray
+    """(F,) log scales."""
+    b: np.ndarray
+    """(N,) log depths in the reconstruction's unit."""
+    m: np.ndarray
+    """(N, 3) map points in the world."""
+
+
+@dataclass(frozen=True)
+class Reduced:
+    """Normal equations H d = -gradient of the cameras after elimination of the map, and the way back."""
+
+    hessian: np.ndarray
+    """(7 F, 7 F)"""
+    gradient: np.ndarray
+    """(7 F,)"""
+    chains: list[np.ndarray]
+    """Banded Cholesky factor of every point's chain."""
+    coupling: np.ndarray
+    """(N, 3, 9)"""
+    columns: np.ndarray
+    """(N, 9) camera columns of the coupling, -1 for none."""
+    point_gradient: np.ndarray
+    """(N, 3)"""
+    depth_rows: tuple[np.ndarray, np.ndarray, np.ndarray]
+    """Of every sighting: coupling of the depth to (camera, map point) (N, 10), gradient (N,), diagonal (N,)."""
+
+    def back_substitute(self, cameras: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Steps of depths (N,) and map points (N, 3) for a step of the cameras (7 F,)."""
+        padded = np.append(cameras, 0.0)
+        right = -(self.point_gradient + np.einsum("nij,nj->ni", self.coupling, padded[self.columns]))
+        points = np.empty_like(right)
+        for factor, first, last in zip(self.chains, starts[:-1], starts[1:], strict=True):
+            points[first:last] = cho_solve_banded((factor, True), right[first:last].ravel()).reshape(-1, 3)
+        rows, gradient, diagonal = self.depth_rows
+        moved = np.concatenate([padded[self.columns[:, :CAMERA]], points], axis=1)
+        return -(gradient + (rows * moved).sum(axis=1)) / diagonal, points
+
+
+class MapTerms:
+    """The map's part of the cost of `assemble.add_reconstruction`."""
+
+    def __init__(self, sightings: Sightings, noise: FusionNoise, model: MapModel):
+        self.n_views = sightings.n_views
+        self.point, self.view = np.nonzero(sightings.seen.T)
+        N = len(self.point)
+        self.image = sightings.image[self.view, self.point]
+        self.log_depth = sightings.log_depth[self.view, self.point]
+        own = sightings.depth_std[self.view, self.point]
+        self.depth_weight = np.where(np.isnan(own), noise.depth, own) ** -2.0
+        self.image_weight = noise.image**-2.0
+        self.huber = model.huber
+        self.starts = np.append(np.flatnonzero(np.diff(self.point, prepend=-1)), N)
+        # Windows of a motion factor: consecutive sightings of one point.
+        size = model.window
+        first = np.arange(N - size + 1) if size <= N else np.empty(0, dtype=int)
+        first = first[self.point[first] == self.point[first + size - 1]]
+        self.window = first[:, None] + np.arange(size)
+        views = self.view[self.window]
+        self.coefficients = np.array([motion_coefficients(row) for row in views]).reshape(-1, size)
+        self.motion_weight = np.array([1.0 / motion_variance(row) for row in views]) / noise.motion**2
+        self.unit_row = scale_view(size)
+        # The coupling's columns of the scales of neighbouring sightings, where a motion factor joins them.
+        self.columns = np.full((N, _COUPLED), -1)
+        self.columns[:, :CAMERA] = CAMERA * self.view[:, None] + np.arange(CAMERA)
+        for k in range(size):
+            if k != self.unit_row:
+                self.columns[self.window[:, k], self._slot(k)] = CAMERA * views[:, self.unit_row] + CAMERA - 1
+
+    def _slot(self, k: int) -> int:
+        """Which column of the coupling holds the scale of a window for its k-th sighting."""
+        return CAMERA - 1 if k == self.unit_row else (CAMERA if k > self.unit_row else CAMERA + 1)
+
+    def start(self, R: np.ndarray, t: np.ndarray, g: np.ndarray) -> MapState:
+        """Map points where cameras, scales and measured depths put them."""
+        distance = np.exp(g[self.view] + self.log_depth)[:, None]
+        rays = np.concatenate([self.image, np.ones((len(self.image), 1))], axis=1)
+        m = t[self.view] + distance * np.einsum("nij,nj->ni", R[self.view], rays)
+        return MapState(R, t, g, self.log_depth.copy(), m)
+
+    def cost(self, state: MapState) -> float:
+        """Half the sum of squares, anchors by Huber's loss."""
+        r, _ = self._anchors(state)
+        norm = np.sqrt(self.image_weight * (r**2).sum(axis=1))
+        loss = np.where(norm <= self.huber, 0.5 * norm**2, self.huber * (norm - 0.5 * self.huber))
+        depth = 0.5 * (self.depth_weight * (state.b - self.log_depth) ** 2).sum()
+        motion = 0.5 * (self.motion_weight * (self._motion(state)[0] ** 2).sum(axis=1)).sum()
+        return float(loss.sum() + depth + motion)
+
+    def reduce(self, state: MapState, damping: float) -> Reduced:
+        """Linearise everything and eliminate depths and map points.
+
+        Raises:
+            numpy.linalg.LinAlgError: a chain's matrix is not positive definite.
+        """
+        N = len(self.point)
+        r, J = self._anchors(state)
+        norm = np.sqrt(self.image_weight * (r**2).sum(axis=1))
+        w = self.image_weight * np.minimum(1.0, self.huber / np.maximum(norm, 1e-300))
+        # Log depths: one row and one column each.
+        q = J[:, :, DEPTH.start]
+        others = np.concatenate([J[:, :, : DEPTH.start], J[:, :, POINT]], axis=2)
+        diagonal = w * (q**2).sum(axis=1) + self.depth_weight + damping
+        rows = w[:, None] * np.einsum("ni,nij->nj", q, others)
+        gradient = w * (q * r).sum(axis=1) + self.depth_weight * (state.b - self.log_depth)
+        normal = w[:, None, None] * np.einsum("nki,nkj->nij", others, others)
+        normal -= rows[:, :, None] * rows[:, None, :] / diagonal[:, None, None]
+        right = w[:, None] * np.einsum("ni,nij->nj", r, others) - rows * (gradient / diagonal)[:, None]
+
+        H = np.zeros((self.n_views, CAMERA, CAMERA))
+        h = np.zeros((self.n_views, CAMERA))
+        np.add.at(H, self.view, normal[:, :CAMERA, :CAMERA])
+        np.add.at(h, self.view, right[:, :CAMERA])
+        coupling = np.zeros((N, 3, _COUPLED))
+        coupling[:, :, :CAMERA] = normal[:, CAMERA:, :CAMERA]
+        blocks = normal[:, CAMERA:, CAMERA:] + damping * np.eye(3)
+        point_gradient = right[:, CAMERA:]
+
+        # Motion: between the map points of a window, and with the scale that gives its unit.
+        motion, unit = self._motion(state)
+        size = self.window.shape[1]
+        off = np.zeros((size, N))  # off[d, n]: couples sightings n and n + d
+        square = self.motion_weight * (motion**2).sum(axis=1)
+        scale_views = self.view[self.window[:, self.unit_row]]
+        np.add.at(H, (scale_views, CAMERA - 1, CAMERA - 1), square)
+        np.add.at(h, (scale_views, CAMERA - 1), -square)
+        for k in range(size):
+            pull = (self.motion_weight * unit * self.coefficients[:, k])[:, None] * motion
+            np.add.at(point_gradient, self.window[:, k], pull)
+            np.add.at(coupling[:, :, self._slot(k)], self.window[:, k], -pull)
+            for l in range(k, size):
+                product = self.motion_weight * unit**2 * self.coefficients[:, k] * self.coefficients[:, l]
+                np.add.at(off[l - k], self.window[:, k], product)
+        blocks += off[0][:, None, None] * np.eye(3)
+
+        hessian = np.zeros((CAMERA * self.n_views, CAMERA * self.n_views))
+        reduced = np.zeros(CAMERA * self.n_views + 1)
+        reduced[:-1] = h.ravel()
+        chains = []
+        for first, last in zip(self.starts[:-1], self.starts[1:], strict=True):
+            factor = cholesky_banded(_banded(blocks[first:last], off[:, first:last]), lower=True)
+            inverse = cho_solve_banded((factor, True), np.eye(3 * (last - first)))
+            part, columns = coupling[first:last], self.columns[first:last]
+            _eliminate(inverse, part, columns, hessian)
+            pulled = cho_solve_banded((factor, True), point_gradient[first:last].ravel()).reshape(-1, 3)
+            np.add.at(reduced, columns, -np.einsum("nij,ni->nj", part, pulled))
+            chains.append(factor)
+        hessian += hessian.T
+        for view in range(self.n_views):
+            block = slice(CAMERA * view, CAMERA * (view + 1))
+            hessian[block, block] += H[view]
+        depth_rows = (rows, gradient, diagonal)
+        return Reduced(hessian, reduced[:-1], chains, coupling, self.columns, point_gradient, depth_rows)
+
+    def _anchors(self, state: MapState) -> tuple[np.ndarray, np.ndarray]:
+        view = self.view
+        return linearise_anchors(state.R[view], state.t[view], state.g[view] + state.b, self.image, state.m)
+
+    def _motion(self, state: MapState) -> tuple[np.ndarray, np.ndarray]:
+        """Residuals (M, 3) of the windows and their units exp(-g) (M,)."""
+        unit = np.exp(-state.g[self.view[self.window[:, self.unit_row]]])
+        return unit[:, None] * np.einsum("mk,mki->mi", self.coefficients, state.m[self.window]), unit
+
+
+def _banded(blocks: np.ndarray, off: np.ndarray) -> np.ndarray:
+    """Lower band of a chain's matrix: 3 x 3 blocks on the diagonal, multiples of the identity beside it."""
+    n = len(blocks)
+    band = np.zeros((3 * len(off), 3 * n))
+    for i in range(3):
+        for j in range(i + 1):
+            band[i - j, j::3] = blocks[:, i, j]
+    for d in range(1, len(off)):
+        band[3 * d] = np.repeat(off[d], 3)
+    return band
+
+
+@njit(cache=True)
+def _eliminate(inverse, coupling, columns, hessian):
+    """Subtract half of E^T A^-1 E from `hessian`, so that its sum with its transpose holds the whole."""
+    n = len(columns)
+    left = np.empty((3, _COUPLED))
+    for k in range(n):
+        for l in range(k, n):
+            share = 0.5 if k == l else 1.0
+            for i in range(3):
+                for c in range(_COUPLED):
+                    total = 0.0
+                    for j in range(3):
+                        total += inverse[3 * k + i, 3 * l + j] * coupling[l, j, c]
+                    left[i, c] = share * total
+            for a in range(_COUPLED):
+                row = columns[k, a]
+                if row < 0:
+                    continue
+                e0, e1, e2 = coupling[k, 0, a], coupling[k, 1, a], coupling[k, 2, a]
+                for c in range(_COUPLED):
+                    column = columns[l, c]
+                    if column >= 0:
+                        hessian[row, column] -= e0 * left[0, c] + e1 * left[1, c] + e2 * left[2, c]
