@@ -60,9 +60,7 @@ def default_config(mode: Literal["default", "paper"] = "default") -> Config:
     """The best known settings, or the published algorithm as written."""
     if mode == "default":
         return Config()
-    return Config(
-        warps=WarpConfig(model="schwarzian"), solve=SolveConfig(schedule="separable"), refinement=False
-    )
+    return Config(warps=WarpConfig(model="schwarzian"), solve=SolveConfig(schedule="separable"), refinement=False)
 
 
 def reconstruct(
@@ -172,7 +170,8 @@ def _record(
     refined: Refined | None,
     progress: Progress,
 ) -> RunRecord:
-    problems = [(edge, report.problem) for edge, report in zip(warps.edges, warps.reports, strict=True) if report.problem]
+    reports = zip(warps.edges, warps.reports, strict=True)
+    problems = [(edge, report.problem) for edge, report in reports if report.problem]
     warnings = [f"warp from image {a} to image {b}: {problem}" for (a, b), problem in problems[:5]]
     if len(problems) > 5:
         warnings.append(f"{len(problems) - 5} more warps had problems")

@@ -159,13 +159,13 @@ def residuals(
         camera: camera model.
     """
     lead = np.shape(data)[:-1]
-    flat = [
+    flat_data, flat_a, flat_b = (
         np.ascontiguousarray(np.broadcast_to(array, (*lead, size)).reshape(-1, size), dtype=float)
         for array, size in ((data, PAIR_DATA_SIZE), (ya, 5), (yb, 5))
-    ]
+    )
     rho = np.ascontiguousarray(np.broadcast_to(log_rho, lead).reshape(-1), dtype=float)
     r = np.empty((len(rho), ROWS))
-    _residuals(*flat, rho, camera.kappa, r)
+    _residuals(flat_data, flat_a, flat_b, rho, camera.kappa, r)
     return r.reshape(*lead, ROWS)
 
 

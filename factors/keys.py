@@ -20,6 +20,8 @@ A key packs a letter (8 bits), a first index (32 bits) and a second index (24 bi
 
 from __future__ import annotations
 
+from typing import SupportsIndex, SupportsInt
+
 FIRST_ORDER = "d"
 SECOND_ORDER = "c"
 LOG_DEPTH = "b"
@@ -63,12 +65,13 @@ def key(letter: str, first: int, second: int = 0) -> int:
     return (ord(letter) << 56) | (int(first) << 24) | int(second)
 
 
-def decode(key: int) -> tuple[str, int, int]:
+def decode(key: SupportsInt | SupportsIndex) -> tuple[str, int, int]:
     """Letter, first index and second index of a key."""
+    key = int(key)
     return chr((key >> 56) & 0xFF), (key >> 24) & (_FIRST_LIMIT - 1), key & (_SECOND_LIMIT - 1)
 
 
-def describe(key: int) -> str:
+def describe(key: SupportsInt | SupportsIndex) -> str:
     """The key in words, e.g. ``log depth of point 12, view 3``; use it as GTSAM's key formatter."""
     letter, first, second = decode(key)
     if letter not in _NAMES:

@@ -45,7 +45,7 @@ def point_graph(
         weight = float(problem.weight[point, edge])
         data = problem.data[point, edge]
         if model == PairModel.ISOMETRIC:
-            sigma = gtsam.noiseModel.Isotropic.Sigma(4, weight**-0.5)
+            sigma: gtsam.noiseModel.Base = gtsam.noiseModel.Isotropic.Sigma(4, weight**-0.5)
             if np.isfinite(noise.huber):
                 sigma = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(noise.huber), sigma)
             factor = isometric_pair_factor(point, (a, b), data, sigma, problem.camera)

@@ -140,12 +140,9 @@ def main(arguments: list[str] | None = None) -> list[dict[str, object]]:
             for solver, value in seconds.items()
         ]
         print(f"{name}: largest difference of the steps {largest_difference(step, values, state, after):.1e}")
+        line = "  {solver:8s} {seconds:10.4f} s  {microseconds per pair:9.2f} us/pair  {times batched:8.1f} x"
         for row in rows[-len(seconds) :]:
-            print(
-                "  {solver:8s} {seconds:10.4f} s  {microseconds per pair:9.2f} us/pair  {times batched:8.1f} x".format(
-                    **row
-                )
-            )
+            print(line.format(**row))
     if options.out is not None:
         options.out.mkdir(parents=True, exist_ok=True)
         with (options.out / "iteration.csv").open("w", newline="") as file:
