@@ -16,10 +16,10 @@ graph's edges is 1 as nearly as a least-squares fit can make it, with mean log d
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
-from scipy.linalg import cholesky, eigh, solve_triangular
+from scipy.linalg import cho_solve, cholesky, eigh, solve_triangular
 from scipy.spatial import Delaunay
 
 from connrsfm_graph.errors import ComputationError
@@ -114,14 +114,6 @@ def integrate(
     return Integrated(log_depth, first, second, bending)
 
 
-class _Spectrum(NamedTuple):
-    """Normal equations diagonalised for every bending weight at once: (A^T W A + mu B)^-1 = V (1 + mu gamma)^-1 V^T."""
-
-    vectors: np.ndarray
-    gamma: np.ndarray
-    right: np.ndarray
-
-
 class SurfaceSpline:
     """Spline over one image that fits log depth or its gradient at the image's points, for any bending weight.
 
@@ -151,7 +143,7 @@ class SurfaceSpline:
         self.target = target * unit
         self.bending = _bending_matrix(self.grid) * extent**2
         self.robust = np.ones(len(weight))
-        self._spectrum: _Spectrum | None = None
+        self._control: tuple[float, np.ndarray] | None = None
 
     def design(self) -> np.ndarray:
         """(N * orders, n^2) dense rows."""
@@ -160,26 +152,20 @@ class SurfaceSpline:
         A[np.arange(N)[:, None, None], np.arange(orders)[:, None], self.columns[:, None, :]] = self.rows
         return A.reshape(N * orders, -1)
 
-    def spectrum(self) -> _Spectrum:
-        if self._spectrum is None:
-            A = self.design()
-            w = self._row_weight()
-            normal = A.T @ (w[:, None] * A)
-            scale = np.trace(normal) / len(normal)
-            # The ridge holds what no point sees (the constant, distant control points); it is far below either term.
-            ridge = SMOOTHINGS[0] * self.bending + 1e-10 * scale * np.eye(len(normal))
-            lower = cholesky(normal + ridge, lower=True)
-            gamma, vectors = eigh(
-                solve_triangular(lower, solve_triangular(lower, self.bending, lower=True).T, lower=True)
-            )
-            vectors = solve_triangular(lower.T, vectors)
-            self._spectrum = _Spectrum(vectors, np.maximum(gamma, 0.0), vectors.T @ (A.T @ (w * self.target.ravel())))
-        return self._spectrum
+    def normal_equations(self) -> tuple[np.ndarray, np.ndarray]:
+        """(n^2, n^2) normal matrix of the data and right-hand side."""
+        A, w = self.design(), self._row_weight()
+        normal = A.T @ (w[:, None] * A)
+        # A ridge far below the data holds what no point sees: the constant and distant control points.
+        normal += 1e-10 * np.trace(normal) / len(normal) * np.eye(len(normal)) + SMOOTHINGS[0] * self.bending
+        return normal, A.T @ (w * self.target.ravel())
 
     def control(self, bending: float) -> np.ndarray:
         """(n^2,) control points for a bending weight."""
-        s = self.spectrum()
-        return s.vectors @ (s.right / (1.0 + bending * s.gamma))
+        if self._control is None or self._control[0] != bending:
+            normal, right = self.normal_equations()
+            self._control = bending, cho_solve((cholesky(normal + bending * self.bending, lower=True), True), right)
+        return self._control[1]
 
     def residual_norms(self, bending: float) -> np.ndarray:
         """(N,) misfit of every point."""
@@ -187,18 +173,25 @@ class SurfaceSpline:
         return np.linalg.norm(fitted - self.target, axis=1)
 
     def score(self, bending: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
-        """Weighted residual sum of squares and effective number of parameters for each bending weight; rows."""
-        s = self.spectrum()
+        """Weighted residual sum of squares and effective number of parameters for each bending weight; rows.
+
+        Diagonalising both quadratic forms together, (normal + mu bending)^-1 = V (1 + mu gamma)^-1 V^T, serves all
+        weights at once; in that basis the data's normal matrix is the identity up to the ridge.
+        """
+        normal, right = self.normal_equations()
+        lower = cholesky(normal, lower=True)
+        half = solve_triangular(lower, self.bending, lower=True)
+        gamma, vectors = eigh(solve_triangular(lower, half.T, lower=True))
+        right = vectors.T @ solve_triangular(lower, right, lower=True)
         total = float((self._row_weight() * self.target.ravel() ** 2).sum())
-        shrink = 1.0 / (1.0 + bending[:, None] * s.gamma)
-        # In the spectral basis A^T W A is the identity up to the ridge.
-        rss = total - (s.right**2 * (2 * shrink - shrink**2)).sum(axis=1)
+        shrink = 1.0 / (1.0 + bending[:, None] * np.maximum(gamma, 0.0))
+        rss = total - (right**2 * (2 * shrink - shrink**2)).sum(axis=1)
         return np.maximum(rss, 0.0), shrink.sum(axis=1), self.target.size
 
     def reweight(self, threshold: float, bending: float) -> None:
         """Huber weights from the present fit."""
         self.robust = np.minimum(1.0, threshold / np.maximum(self.residual_norms(bending), 1e-300))
-        self._spectrum = None
+        self._control = None
 
     def surface(self, image: np.ndarray, bending: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Fitted function, first- and second-order terms of the surface at image points."""

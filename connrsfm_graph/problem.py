@@ -49,7 +49,7 @@ class Problem:
             np.logical_or.at(touched.T, self.edges[:, end], (self.weight > 0).T)
         return touched
 
-    def points(self, block: slice) -> Problem:
+    def points(self, block: slice | np.ndarray) -> Problem:
         """The problem of some points."""
         return replace(
             self,

@@ -41,7 +41,7 @@ class Levenberg:
 
     max_iterations: int = 30
     """Accepted steps at most."""
-    tolerance: float = 1e-5
+    tolerance: float = 1e-4
     """Relative decrease of a point's cost at which it has converged."""
     damping: float = 1e-3
     """Initial damping, added to the diagonal of the normal equations."""

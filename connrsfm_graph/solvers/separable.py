@@ -28,6 +28,8 @@ from factors.noise import PairNoise
 
 JOINT = ("d", "c", "s")
 """Active variables of the joint schedule; depths follow by integration, since pair factors do not see them."""
+OFF_SURFACE = 3.0
+"""Misfit of a point's first-order terms, in medians over all, from which it starts again from the surface."""
 RESTART_GAIN = 1e-3
 """Relative decrease of a point's cost that counts as a better minimum."""
 
@@ -94,20 +96,24 @@ def solve(
 def _restart_from_surface(
     problem: Problem, minimum: Minimum, backend: Backend, config: SolveConfig
 ) -> tuple[Minimum, bool]:
-    """Start every point again from the surface through all points and keep the better of both minima.
+    """Start points that disagree with the surface through all points again from it; keep the better of both minima.
 
     A point's cost has several minima (a patch seen concave or convex); its neighbours know which is right.
     """
     surface = integrate(problem, minimum.state)
+    misfit = np.linalg.norm(minimum.state.first_order - surface.first_order, axis=-1) * problem.constrained()
+    again = np.flatnonzero(misfit.max(axis=1) > OFF_SURFACE * np.median(misfit[misfit > 0]))
     start = minimum.state.updated(first_order=surface.first_order, second_order=surface.second_order)
-    start = with_closed_form_scale(problem, start, config.noise)
-    again = backend.minimise(problem, start, JOINT, config.noise, settings=config.levenberg)
-    better = again.cost < (1.0 - RESTART_GAIN) * minimum.cost
-    frame = np.where(better[:, None, None], again.state.frame, minimum.state.frame)
-    log_scale = np.where(better[:, None], again.state.log_scale, minimum.state.log_scale)
-    kept = Minimum(
-        State(frame, log_scale), np.where(better, again.cost, minimum.cost), minimum.iterations + again.iterations
-    )
+    start = State(start.frame[again], start.log_scale[again])
+    part = problem.points(again)
+    start = with_closed_form_scale(part, start, config.noise)
+    trial = backend.minimise(part, start, JOINT, config.noise, settings=config.levenberg)
+    better = trial.cost < (1.0 - RESTART_GAIN) * minimum.cost[again]
+    chosen = again[better]
+    kept = Minimum(minimum.state.updated(), minimum.cost.copy(), minimum.iterations.copy())
+    kept.state.frame[chosen], kept.state.log_scale[chosen] = trial.state.frame[better], trial.state.log_scale[better]
+    kept.cost[chosen] = trial.cost[better]
+    kept.iterations[again] += trial.iterations
     return kept, bool(better.any())
 
 

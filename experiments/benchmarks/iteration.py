@@ -112,9 +112,7 @@ def main(arguments: list[str] | None = None) -> list[dict[str, object]]:
     problem, state = bending_problem(options.frames, options.points)
     pairs = int((problem.weight > 0).sum())
     backend = BatchedBackend()
-    print(
-        f"{platform.processor() or platform.machine()}, {numba.get_num_threads()} threads, Python {platform.python_version()}"
-    )
+    print(f"{platform.machine()}, {numba.get_num_threads()} threads, Python {platform.python_version()}")
     print(f"{options.frames} images x {options.points} points, {pairs} point-edge pairs")
     rows: list[dict[str, object]] = []
     for name, active in ACTIVE.items():
@@ -140,9 +138,12 @@ def main(arguments: list[str] | None = None) -> list[dict[str, object]]:
             for solver, value in seconds.items()
         ]
         print(f"{name}: largest difference of the steps {largest_difference(step, values, state, after):.1e}")
-        line = "  {solver:8s} {seconds:10.4f} s  {microseconds per pair:9.2f} us/pair  {times batched:8.1f} x"
         for row in rows[-len(seconds) :]:
-            print(line.format(**row))
+            print(
+                "  {solver:8s} {seconds:10.4f} s  {microseconds per pair:9.2f} us/pair  {times batched:8.1f} x".format(
+                    **row
+                )
+            )
     if options.out is not None:
         options.out.mkdir(parents=True, exist_ok=True)
         with (options.out / "iteration.csv").open("w", newline="") as file:
