@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 
+from connrsfm_graph.baselines import BASELINES
 from connrsfm_graph.config import as_dict
 from connrsfm_graph.errors import ComputationError
 from connrsfm_graph.image_graph import GraphConfig, ImageGraph, select_edges
@@ -102,7 +103,10 @@ def reconstruct(
     return result, _record(tracks, config, graph, warps, problem, solved, refined, progress)
 
 
-METHODS: dict[str, Callable[[Tracks, Config, Progress], tuple[Reconstruction, RunRecord]]] = {"connrsfm": reconstruct}
+METHODS: dict[str, Callable[[Tracks, Config, Progress], tuple[Reconstruction, RunRecord]]] = {
+    "connrsfm": reconstruct,
+    **BASELINES,
+}
 """Methods by name; a baseline is one more entry."""
 
 
