@@ -18,14 +18,15 @@ from factors.edge_length import arc_offset, log_chord_kernel
 BENDING_CAP = 6.0
 """A hinge's coefficients are scaled down to at most this times their median: slivers carry no curvature."""
 
+QUADRIC_RIDGE = 1e-2
+"""Keeps the quadric about a vertex flat where it has too few neighbours to show its curvature."""
+
 
 class Weights(NamedTuple):
     """Inverse standard deviations. A named tuple, since compiled code takes it as it is."""
 
-    length: np.ndarray
-    """(E,) of the log length residuals."""
     huber: float
-    """Residuals beyond this many standard deviations count linearly."""
+    """Length residuals beyond this many standard deviations count linearly."""
     bending: float
     """Of the hinge residual; 0 switches bending off."""
     smoothness: float
@@ -57,7 +58,7 @@ def hinge_stencils(length, hinge_edges, coefficients):
 
 
 @njit(cache=True)
-def _view_cost(X, f, length, offset, correction, image_weight, edges, n_near, hinges, stencils, weights):
+def _view_cost(X, f, length, offset, correction, image_weight, length_weight, edges, n_near, hinges, stencils, weights):
     """Half the robust weighted sum of squares of one view.
 
     Args:
@@ -67,6 +68,7 @@ def _view_cost(X, f, length, offset, correction, image_weight, edges, n_near, hi
         offset: (E,) log ratio of arc to chord.
         correction: (P, 2) ray corrections.
         image_weight: (P,) inverse standard deviation of the image points.
+        length_weight: (E,) inverse standard deviation of the log length residuals.
         edges, n_near, hinges: the mesh.
         stencils: (H, 4) hinge coefficients.
         weights: see `Weights`.
@@ -80,7 +82,7 @@ def _view_cost(X, f, length, offset, correction, image_weight, edges, n_near, hi
             r -= 0.5 * (f[i] + f[k])
             if e < n_near:
                 total += 0.5 * (weights.smoothness * (f[i] - f[k])) ** 2
-        r = abs(r * weights.length[e])
+        r = abs(r * length_weight[e])
         total += 0.5 * r * r if r <= weights.huber else weights.huber * (r - 0.5 * weights.huber)
     for i in range(len(X)):
         total += 0.5 * image_weight[i] ** 2 * (correction[i, 0] ** 2 + correction[i, 1] ** 2)
@@ -98,7 +100,7 @@ def _view_cost(X, f, length, offset, correction, image_weight, edges, n_near, hi
 
 @njit(cache=True)
 def _linearise_view(
-    X, f, length, offset, correction, image_weight, edges, n_near, hinges, stencils, weights, envelope,
+    X, f, length, offset, correction, image_weight, length_weight, edges, n_near, hinges, stencils, weights, envelope,
     matrix, gradient, border, residual, inverse_variance,
 ):  # fmt: skip
     """Normal equations of one view; arguments before `envelope` as in `_view_cost`.
@@ -137,8 +139,8 @@ def _linearise_view(
                 matrix[row[max(at[3], at[7])] + min(at[3], at[7])] -= w
                 gradient[at[3]] += w * (f[i] - f[k])
                 gradient[at[7]] += w * (f[k] - f[i])
-        w = weights.length[e] ** 2
-        size = abs(r) * weights.length[e]
+        w = length_weight[e] ** 2
+        size = abs(r) * length_weight[e]
         if size > weights.huber:
             w *= weights.huber / size
         residual[e], inverse_variance[e] = r, w
@@ -181,29 +183,88 @@ def _add_row(matrix, row, gradient, at, J, n, w, r):
                 matrix[row[at[a]] + at[b]] += w * J[a] * J[b]
 
 
-@njit(cache=True)
-def _arc_offsets(X, triangles, edges, offset):
-    """Log ratio of arc to chord of every edge of one view, from the vertex normals of its mesh."""
-    normal = np.zeros_like(X)
+@njit(cache=True, inline="always")
+def _triangle_normals(X, triangles, normal):
+    """Normals (P, 3) of the vertices: those of the triangles around them, weighted by area."""
+    normal[:] = 0.0
     for t in range(len(triangles)):
         i, j, k = triangles[t]
-        cross = np.cross(X[j] - X[i], X[k] - X[i])
-        normal[i] += cross
-        normal[j] += cross
-        normal[k] += cross
+        a, b = X[j] - X[i], X[k] - X[i]
+        cross = (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+        for c in range(3):
+            normal[i, c] += cross[c]
+            normal[j, c] += cross[c]
+            normal[k, c] += cross[c]
     for i in range(len(X)):
         size = np.sqrt(normal[i, 0] ** 2 + normal[i, 1] ** 2 + normal[i, 2] ** 2)
         if size > 0.0:
             normal[i] /= size
+        else:
+            normal[i] = X[i] / np.sqrt(X[i, 0] ** 2 + X[i, 1] ** 2 + X[i, 2] ** 2)
+
+
+@njit(cache=True)
+def _arc_offsets(X, triangles, edges, offset):
+    """Log ratio of arc to chord of every edge of one view.
+
+    Slopes come from a quadric about each vertex, fitted to its neighbours' heights over the plane of its triangles'
+    mean normal; the mean normal alone is one-sided at the border.
+    """
+    P = len(X)
+    normal, axis = np.empty((P, 3)), np.empty((P, 2, 3))
+    _triangle_normals(X, triangles, normal)
+    scale, count = np.zeros(P), np.zeros(P)
     for e in range(len(edges)):
         i, k = edges[e]
-        chord = X[k] - X[i]
-        size = np.sqrt(chord[0] ** 2 + chord[1] ** 2 + chord[2] ** 2)
+        square = (X[k, 0] - X[i, 0]) ** 2 + (X[k, 1] - X[i, 1]) ** 2 + (X[k, 2] - X[i, 2]) ** 2
+        for p in (i, k):
+            scale[p] += square
+            count[p] += 1.0
+    for i in range(P):
+        n = normal[i]
+        scale[i] = np.sqrt(scale[i] / max(count[i], 1.0))
+        c = 0 if abs(n[0]) < 0.6 else 1
+        t = -n[c] * n
+        t[c] += 1.0
+        t /= np.sqrt(t[0] ** 2 + t[1] ** 2 + t[2] ** 2)
+        axis[i, 0] = t
+        axis[i, 1, 0] = n[1] * t[2] - n[2] * t[1]
+        axis[i, 1, 1] = n[2] * t[0] - n[0] * t[2]
+        axis[i, 1, 2] = n[0] * t[1] - n[1] * t[0]
+    A, b, row = np.zeros((P, 5, 5)), np.zeros((P, 5)), np.empty(5)
+    for e in range(len(edges)):
+        for end in range(2):
+            p, other = edges[e, end], edges[e, 1 - end]
+            if not scale[p] > 0.0:
+                continue
+            x = y = h = 0.0
+            for c in range(3):
+                d = (X[other, c] - X[p, c]) / scale[p]
+                x += d * axis[p, 0, c]
+                y += d * axis[p, 1, c]
+                h += d * normal[p, c]
+            row[0], row[1], row[2], row[3], row[4] = x, y, x * x, x * y, y * y
+            weight = 1.0 / max(x * x + y * y, 1e-4)
+            for r in range(5):
+                b[p, r] += weight * row[r] * h
+                for c in range(5):
+                    A[p, r, c] += weight * row[r] * row[c]
+    for i in range(P):
+        for r in range(5):
+            A[i, r, r] += QUADRIC_RIDGE
+        slope = np.linalg.solve(A[i], b[i])
+        normal[i] -= slope[0] * axis[i, 0] + slope[1] * axis[i, 1]
+        normal[i] /= np.sqrt(normal[i, 0] ** 2 + normal[i, 1] ** 2 + normal[i, 2] ** 2)
+    for e in range(len(edges)):
+        i, k = edges[e]
+        dx, dy, dz = X[k, 0] - X[i, 0], X[k, 1] - X[i, 1], X[k, 2] - X[i, 2]
+        size = np.sqrt(dx * dx + dy * dy + dz * dz)
+        offset[e] = 0.0
         if size > 0.0:
-            a, b = np.dot(normal[i], chord) / size, np.dot(normal[k], chord) / size
-            offset[e] = arc_offset(a, b)
-        else:
-            offset[e] = 0.0
+            offset[e] = arc_offset(
+                (normal[i, 0] * dx + normal[i, 1] * dy + normal[i, 2] * dz) / size,
+                (normal[k, 0] * dx + normal[k, 1] * dy + normal[k, 2] * dz) / size,
+            )
 
 
 @njit(cache=True, nogil=True)
@@ -215,23 +276,48 @@ def arc_offset_kernel(first, last, X, triangles, edges, offset):
 
 @njit(cache=True, nogil=True)
 def cost_kernel(
-    first, last, X, f, length, offset, correction, image_weight, edges, n_near, hinges, stencils, weights, cost
+    first,
+    last,
+    X,
+    f,
+    length,
+    offset,
+    correction,
+    image_weight,
+    length_weight,
+    edges,
+    n_near,
+    hinges,
+    stencils,
+    weights,
+    cost,
 ):
     """Cost of views first to last - 1 into `cost` (F,); arguments as in `_view_cost`, with a dimension for views."""
     for v in range(first, last):
         cost[v] = _view_cost(
-            X[v], f[v], length, offset[v], correction[v], image_weight[v], edges, n_near, hinges, stencils, weights
+            X[v],
+            f[v],
+            length,
+            offset[v],
+            correction[v],
+            image_weight[v],
+            length_weight[v],
+            edges,
+            n_near,
+            hinges,
+            stencils,
+            weights,
         )
 
 
 @njit(cache=True, nogil=True)
 def linearise_kernel(
-    first, last, X, f, length, offset, correction, image_weight, edges, n_near, hinges, stencils, weights, envelope,
+    first, last, X, f, length, offset, correction, image_weight, length_weight, edges, n_near, hinges, stencils, weights, envelope,
     matrix, gradient, border, residual, inverse_variance,
 ):  # fmt: skip
     """Normal equations of views first to last - 1; arguments as in `_linearise_view`, with a dimension for views."""
     for v in range(first, last):
         _linearise_view(
-            X[v], f[v], length, offset[v], correction[v], image_weight[v], edges, n_near, hinges, stencils, weights,
+            X[v], f[v], length, offset[v], correction[v], image_weight[v], length_weight[v], edges, n_near, hinges, stencils, weights,
             envelope, matrix[v], gradient[v], border[v], residual[v], inverse_variance[v],
         )  # fmt: skip

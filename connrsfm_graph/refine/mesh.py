@@ -39,7 +39,7 @@ class Mesh:
         return len(self.position)
 
     def order(self) -> np.ndarray:
-        """(P,) position of every point in a sweep across the surface, in the direction with the fewest stored entries."""
+        """(P,) position of every point in the sweep across the surface whose matrices have the smallest envelope."""
         terms = self.edges if len(self.hinges) == 0 else np.concatenate([self.edges, self.hinges[:, 2:]])
         best, fewest = np.arange(self.n_points), np.inf
         for angle in np.linspace(0.0, np.pi, 8, endpoint=False):

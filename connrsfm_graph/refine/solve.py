@@ -52,6 +52,8 @@ class Measurements:
     """(F, P, 2) image points, normalised coordinates; finite everywhere, interpolated where not seen."""
     image_weight: np.ndarray
     """(F, P) inverse standard deviation of the image points."""
+    length_weight: np.ndarray
+    """(F, E) inverse standard deviation of the log lengths."""
     mesh: Mesh
     """Edges and hinges."""
     weights: Weights
@@ -63,7 +65,12 @@ class Measurements:
 
     def views(self, index: np.ndarray | slice) -> Measurements:
         """The measurements of some views."""
-        return replace(self, image=self.image[index], image_weight=self.image_weight[index])
+        return replace(
+            self,
+            image=self.image[index],
+            image_weight=self.image_weight[index],
+            length_weight=self.length_weight[index],
+        )
 
 
 @dataclass(frozen=True)
@@ -127,6 +134,7 @@ def _arguments(measurements: Measurements, shape: Shape, lagged: Lagged) -> tupl
         lagged.offset,
         shape.correction,
         measurements.image_weight,
+        measurements.length_weight,
         mesh.edges,
         mesh.n_near,
         mesh.hinges,

@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 
 from connrsfm_graph.errors import InputError
 from connrsfm_graph.refine.cost import Weights
-from connrsfm_graph.refine.mesh import Mesh
+from connrsfm_graph.refine.noise import Noise
 from connrsfm_graph.refine.solve import Measurements, Shape, lag, linearise, minimise
 from connrsfm_graph.refine.start import start_mesh, start_shape
-from connrsfm_graph.refine.unseen import complete
+from connrsfm_graph.refine.unseen import Completed, complete
+from connrsfm_graph.refine.wrong_tracks import wrong_tracks
 
 _UNIT = 1e3
 """Inverse standard deviation of the mean log length."""
-_LEAST_NOISE = 1e-4
-"""Smallest image noise, relative to the median image length of a mesh edge."""
-_OVERESTIMATED = 0.7
-"""Corrections below this part of the assumed image noise show that it was assumed too large."""
+_ROUNDS = 4
+"""Fits with noise levels that the one before has shown."""
+_ATTEMPTS = 3
+"""Fits without the tracks that the one before has shown to be wrong."""
 
 
 @dataclass(frozen=True)
@@ -29,12 +30,12 @@ class RefineConfig:
 
     length_sigma: float = 0.01
     """Standard deviation of a log edge length in one view: what the surface stretches, and the mesh does not show."""
-    huber: float = 1.0
-    """Length residuals beyond this many standard deviations count linearly."""
     rings: int = 2
     """Edges join points up to this distance in the triangulation, 1 or 2."""
-    bending: Literal["auto", "on", "off"] = "auto"
-    """Whether surfaces are kept from bending."""
+    outliers: bool = True
+    """Whether wrong tracks are looked for and replaced by what the other points and views say."""
+    bending: bool = False
+    """Whether surfaces are kept from bending. Latent lengths alone already keep noise from crumpling a surface."""
     bending_sigma: float = 8.0
     """Standard deviation of the hinges' curvature vectors relative to their size."""
     iterations: int = 30
@@ -43,7 +44,7 @@ class RefineConfig:
     """The solver stops where an iteration lowers the cost by less than this part."""
 
     def __post_init__(self) -> None:
-        for name in ("length_sigma", "huber", "bending_sigma"):
+        for name in ("length_sigma", "bending_sigma"):
             if not getattr(self, name) > 0.0:
                 raise InputError(f"refine.{name} is {getattr(self, name)}, expected a positive number")
         if self.rings not in (1, 2):
@@ -104,43 +105,72 @@ def refine(
         InputError: arrays do not fit, or a view has nothing to start from.
     """
     image, visible, log_depth = _checked(image, visible, log_depth)
-    used = visible.any(axis=0)
-    completed = complete(image[:, used], visible[:, used], log_depth[:, used])
-    seen = visible[:, used]
-    mesh = start_mesh(completed, seen, config.rings)
-    spacing = float(np.median(_image_lengths(completed.image, mesh)))
-    sigma = max(sigma_image if np.isfinite(sigma_image) else 0.0, _LEAST_NOISE * spacing)
-    shape = start_shape(completed, mesh)
-    measurements = Measurements(
-        image=completed.image,
-        image_weight=_image_weight(seen, sigma, completed.spread),
-        mesh=mesh,
-        weights=make_weights(config, len(mesh.edges), bending=config.bending == "on"),
-    )
-    shape, history = minimise(measurements, shape, config.iterations, config.tolerance)
-    correction = float(np.sqrt((shape.correction[seen] ** 2).mean()))
-    evidence: dict[str, Any] = {
-        "image noise": sigma,
-        "image noise over image length of an edge": float(np.sqrt(2.0)) * sigma / spacing,
-        "bending": measurements.weights.bending > 0.0,
-        "root mean square ray correction": correction,
-    }
-    if correction < _OVERESTIMATED * sigma:
-        sigma = max(correction, _LEAST_NOISE * spacing)
-        measurements = replace(measurements, image_weight=_image_weight(seen, sigma, completed.spread))
-        shape, more = minimise(measurements, shape, config.iterations, config.tolerance)
-        history += more
-        evidence["image noise after the first fit"] = sigma
+    outlier = wrong_tracks(image, visible) if config.outliers else np.zeros_like(visible)
+    for _ in range(_ATTEMPTS):
+        used = (visible & ~outlier).any(axis=0)
+        seen = (visible & ~outlier)[:, used]
+        completed = complete(image[:, used], seen, np.where(outlier, np.nan, log_depth)[:, used])
+        fit = _fit(completed, seen, config, sigma_image)
+        if not config.outliers:
+            break
+        late = np.zeros_like(visible)
+        late[:, used] = fit.wrong
+        if not late.any():
+            break
+        outlier |= late
     if progress is not None:
         progress(1, 1)
-    return _refined(measurements, shape, seen, used, evidence, history)
+    return _refined(fit, seen, used, outlier)
 
 
-def make_weights(config: RefineConfig, n_edges: int, bending: bool) -> Weights:
+@dataclass(frozen=True)
+class _Fit:
+    """A shape that fits all observations taken for right."""
+
+    measurements: Measurements
+    shape: Shape
+    history: list[float]
+    evidence: dict[str, Any]
+    wrong: np.ndarray
+    """(F, P) bool, observations that the shape contradicts."""
+
+
+def _fit(completed: Completed, seen: np.ndarray, config: RefineConfig, sigma_image: float) -> _Fit:
+    mesh = start_mesh(completed, seen, config.rings)
+    shape = start_shape(completed, mesh)
+    near = mesh.edges[: mesh.n_near]
+    spacing = float(np.median(np.linalg.norm(completed.image[:, near[:, 0]] - completed.image[:, near[:, 1]], axis=-1)))
+    noise = Noise.start(sigma_image, spacing)
+    history: list[float] = []
+    for _ in range(_ROUNDS):
+        measurements = Measurements(
+            image=completed.image,
+            image_weight=noise.image_weight(seen, completed.deviation),
+            length_weight=np.full((len(seen), len(mesh.edges)), 1.0 / config.length_sigma),
+            mesh=mesh,
+            weights=make_weights(config, noise.huber, bending=config.bending),
+        )
+        shape, costs = minimise(measurements, shape, config.iterations, config.tolerance)
+        history += costs
+        residual = linearise(measurements, shape, lag(measurements, shape), measurements.envelope(False))[1]
+        last, noise = noise, noise.updated(shape.correction[seen], residual / config.length_sigma)
+        if noise.settled(last):
+            break
+    correction = np.linalg.norm(shape.correction, axis=-1)
+    evidence = {
+        "image noise": noise.sigma,
+        "image noise over image length of an edge": float(np.sqrt(2.0)) * noise.sigma / spacing,
+        "root mean square ray correction": float(np.sqrt((shape.correction[seen] ** 2).mean())),
+        "median absolute length residual": float(np.median(np.abs(residual))),
+        "bending": config.bending,
+    }
+    return _Fit(measurements, shape, history, evidence, seen & (correction > noise.gross(correction[seen])))
+
+
+def make_weights(config: RefineConfig, huber: float, bending: bool) -> Weights:
     """Weights of the cost's terms."""
     return Weights(
-        length=np.full(n_edges, 1.0 / config.length_sigma),
-        huber=config.huber,
+        huber=huber,
         bending=1.0 / config.bending_sigma if bending else 0.0,
         smoothness=0.0,
         factor=0.0,
@@ -163,42 +193,24 @@ def _checked(image: np.ndarray, visible: np.ndarray, log_depth: np.ndarray) -> t
     return np.where(visible[..., None], image, 0.0), visible, log_depth
 
 
-def _image_lengths(image: np.ndarray, mesh: Mesh) -> np.ndarray:
-    near = mesh.edges[: mesh.n_near]
-    return np.linalg.norm(image[:, near[:, 0]] - image[:, near[:, 1]], axis=-1)
-
-
-def _image_weight(seen: np.ndarray, sigma: float, spread: np.ndarray) -> np.ndarray:
-    return 1.0 / np.where(seen, sigma, np.maximum(sigma, spread)[:, None])
-
-
-def _refined(
-    measurements: Measurements,
-    shape: Shape,
-    seen: np.ndarray,
-    used: np.ndarray,
-    evidence: dict[str, Any],
-    history: list[float],
-) -> Refined:
-    _, residual = linearise(measurements, shape, lag(measurements, shape), measurements.envelope(False))
-    evidence["median absolute length residual"] = float(np.median(np.abs(residual)))
-
+def _refined(fit: _Fit, seen: np.ndarray, used: np.ndarray, outlier: np.ndarray) -> Refined:
     def all_points(values: np.ndarray) -> np.ndarray:
         full = np.full((len(values), len(used), *values.shape[2:]), np.nan)
         full[:, used] = values
         return full
 
+    measurements, shape = fit.measurements, fit.shape
     conformal = shape.log_factor.size > 0
     return Refined(
         points=all_points(shape.points(measurements.image)),
         log_depth=all_points(shape.log_depth),
-        depth_std=np.full((len(seen), len(used)), np.nan),
+        depth_std=np.full(outlier.shape, np.nan),
         ray_correction=all_points(np.where(seen[..., None], shape.correction, np.nan)),
         log_factor=all_points(shape.log_factor if conformal else np.zeros_like(shape.log_depth)),
         log_length=shape.log_length,
         mesh_edges=np.flatnonzero(used)[measurements.mesh.edges],
-        outlier=np.zeros((len(seen), len(used)), dtype=bool),
+        outlier=outlier,
         model="conformal" if conformal else "isometric",
-        evidence=evidence,
-        cost_history=tuple(history),
+        evidence=fit.evidence,
+        cost_history=tuple(fit.history),
     )

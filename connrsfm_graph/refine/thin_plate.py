@@ -1,4 +1,4 @@
-"""Thin-plate splines: the smoothest map of the plane through given values, with its own leave-one-out errors."""
+"""Thin-plate splines: the smoothest map of the plane through given values, and how far to trust it."""
 
 from __future__ import annotations
 
@@ -23,13 +23,23 @@ class ThinPlate:
     """(N, 2) normalised data sites; (0, 2) for an affine map."""
     coefficients: np.ndarray
     """(N + 3, D) of the kernels at the sites and of 1, x, y."""
-    left_out: np.ndarray
-    """(N', D) error at each data point of the map fitted to all others."""
+    inverse: np.ndarray
+    """(N + 3, N + 3) inverse of the interpolation's system."""
+    roughness: float
+    """Standard deviation that leave-one-out errors show, in units of the one that the system predicts up to a factor."""
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """Values (M, D) at points (M, 2)."""
+        return self._rows(x) @ self.coefficients
+
+    def deviation(self, x: np.ndarray) -> np.ndarray:
+        """Standard deviation (M,) of each value at points (M, 2): kriging's, small near the sites, large far out."""
+        rows = self._rows(x)
+        return self.roughness * np.sqrt(np.abs(np.einsum("mi,ij,mj->m", rows, self.inverse, rows)))
+
+    def _rows(self, x: np.ndarray) -> np.ndarray:
         x = (x - self.centre) / self.spread
-        return np.concatenate([_kernel(x, self.sites), _affine(x)], axis=1) @ self.coefficients
+        return np.concatenate([_kernel(x, self.sites), _affine(x)], axis=1)
 
 
 def fit_thin_plate(x: np.ndarray, y: np.ndarray) -> ThinPlate:
@@ -39,16 +49,19 @@ def fit_thin_plate(x: np.ndarray, y: np.ndarray) -> ThinPlate:
     sites = (x - centre) / spread
     N, affine = len(x), _affine(sites)
     if N < _FEWEST:
-        coefficients = np.linalg.lstsq(affine, y, rcond=1e-6)[0]
-        return ThinPlate(centre, spread, np.empty((0, 2)), coefficients, y - affine @ coefficients)
+        inverse = np.linalg.pinv(affine.T @ affine, rcond=1e-9, hermitian=True)
+        coefficients = inverse @ affine.T @ y
+        return ThinPlate(centre, spread, np.empty((0, 2)), coefficients, inverse, float(y.std(axis=0).max()))
     system = np.zeros((N + 3, N + 3))
     system[:N, :N] = _kernel(sites, sites) + _RIDGE * np.eye(N)
     system[:N, N:], system[N:, :N] = affine, affine.T
     inverse = np.linalg.pinv(system, hermitian=True)
     coefficients = inverse[:, :N] @ y
-    # Leaving out one equation of an interpolation changes its prediction by coefficient / diagonal of the inverse.
-    left_out = coefficients[:N] / np.diag(inverse)[:N, None]
-    return ThinPlate(centre, spread, sites, coefficients, left_out)
+    # Leaving out one equation of an interpolation changes its prediction by coefficient / diagonal of the inverse; the
+    # variance of that error is 1 / diagonal up to a factor.
+    diagonal = np.maximum(np.abs(np.diag(inverse)[:N]), 1e-300)
+    errors = np.linalg.norm(coefficients[:N], axis=1) / np.sqrt(y.shape[1] * diagonal)
+    return ThinPlate(centre, spread, sites, coefficients, inverse, float(np.sqrt((errors**2).mean())))
 
 
 def _kernel(x: np.ndarray, sites: np.ndarray) -> np.ndarray:

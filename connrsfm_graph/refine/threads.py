@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from itertools import pairwise
 from typing import Any
 
 import numba
@@ -26,6 +27,6 @@ def over_views(kernel: Callable[..., None], n_views: int, *arguments: Any) -> No
         kernel(0, n_views, *arguments)
         return
     bounds = [n_views * n // threads for n in range(threads + 1)]
-    tasks = [_pool(threads).submit(kernel, a, b, *arguments) for a, b in zip(bounds, bounds[1:], strict=False)]
+    tasks = [_pool(threads).submit(kernel, a, b, *arguments) for a, b in pairwise(bounds)]
     for task in tasks:
         task.result()

@@ -1,7 +1,7 @@
 """Points where they were not seen: first guesses from the points around them.
 
 The tracks of all views are gathered on one plane, the template. A view is then a smooth map of the template, fitted
-to the points it sees; it tells where the others are, and its leave-one-out errors tell how well.
+to the points it sees; it tells where the others are, and how surely.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ class Completed:
     """(F, P, 2) image points, interpolated where not seen."""
     log_depth: np.ndarray
     """(F, P) likewise."""
-    spread: np.ndarray
-    """(F,) standard deviation of a coordinate of the interpolated image points, from leave-one-out errors."""
+    deviation: np.ndarray
+    """(F, P) standard deviation of a coordinate of the interpolated image points, 0 where seen."""
 
 
 def complete(image: np.ndarray, visible: np.ndarray, log_depth: np.ndarray) -> Completed:
@@ -36,33 +36,38 @@ def complete(image: np.ndarray, visible: np.ndarray, log_depth: np.ndarray) -> C
         visible: (F, P) bool; every point in some view, every view with some point.
         log_depth: (F, P); where a visible one is NaN it is interpolated as well.
     """
-    template = make_template(image, visible)
+    template, uncertainty = make_template(image, visible)
     known = visible & np.isfinite(log_depth)
-    image, log_depth, spread = image.copy(), log_depth.copy(), np.zeros(len(image))
+    image, log_depth, deviation = image.copy(), log_depth.copy(), np.zeros(visible.shape)
     for f, seen in enumerate(visible):
         if not seen.all():
             warp = fit_thin_plate(template[seen], image[f, seen])
             image[f, ~seen] = warp(template[~seen])
-            # The median of the norm of a plane Gaussian vector is 1.18 standard deviations.
-            spread[f] = np.median(np.linalg.norm(warp.left_out, axis=1)) / 1.18
+            deviation[f, ~seen] = np.hypot(warp.deviation(template[~seen]), uncertainty[~seen])
         if not known[f].any():
             raise InputError(f"refinement: image {f} has no point with a depth to start from")
         if not known[f].all():
             surface = fit_thin_plate(template[known[f]], log_depth[f, known[f], None])
             log_depth[f, ~known[f]] = surface(template[~known[f]])[:, 0]
-    return Completed(template, image, log_depth, spread)
+    return Completed(template, image, log_depth, deviation)
 
 
-def make_template(image: np.ndarray, visible: np.ndarray) -> np.ndarray:
-    """(P, 2) all points on the image plane of the view that sees most, other views warped onto it one by one."""
+def make_template(image: np.ndarray, visible: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """All points on the image plane of the view that sees most, other views warped onto it one by one.
+
+    Returns:
+        (P, 2) positions and the (P,) standard deviation of their coordinates.
+    """
     base = int(visible.sum(axis=1).argmax())
     template, known = np.where(visible[base, :, None], image[base], 0.0), visible[base].copy()
+    deviation = np.zeros(len(template))
     while not known.all():
         shared = (visible & known).sum(axis=1)
         view = int(np.where((visible & ~known).any(axis=1), shared, -1).argmax())
         if shared[view] == 0:
             raise InputError(f"refinement: image {view} shares no track with the others")
         common, new = visible[view] & known, visible[view] & ~known
-        template[new] = fit_thin_plate(image[view, common], template[common])(image[view, new])
+        warp = fit_thin_plate(image[view, common], template[common])
+        template[new], deviation[new] = warp(image[view, new]), warp.deviation(image[view, new])
         known |= new
-    return template
+    return template, deviation
