@@ -2,10 +2,12 @@
 
 Fronto-parallel planes are far enough from most answers to be neutral and near enough for Levenberg-Marquardt, which
 converges from them in 10 to 25 iterations. Second-order terms start at those of the tangent planes, scales at the
-closed-form value.
+closed-form value. For ablations the pre-step can be left out and the slopes given instead.
 """
 
 from __future__ import annotations
+
+from typing import Literal
 
 import numpy as np
 
@@ -14,13 +16,34 @@ from connrsfm_graph.solvers.interface import Backend, Levenberg, PairModel
 from factors.conformal_scale import closed_form_log_rho
 from factors.noise import PairNoise
 
+Start = Literal["pre-step", "zeros", "ones", "random"]
 
-def initialise(problem: Problem, backend: Backend, settings: Levenberg = Levenberg()) -> State:
-    """Solve the isometric pair factors of every point from zeros."""
-    minimum = backend.minimise(
-        problem, flat_state(problem), ("d",), PairNoise(), model=PairModel.ISOMETRIC, settings=settings
-    )
-    state = planar_state(problem, minimum.state.first_order)
+
+def initialise(
+    problem: Problem,
+    backend: Backend,
+    settings: Levenberg = Levenberg(),
+    start: Start = "pre-step",
+    seed: int = 0,
+) -> State:
+    """Where the differential solve starts.
+
+    Args:
+        problem, backend, settings: as for the solve.
+        start: `pre-step` solves the isometric pair factors of every point from zeros; the others set all first-order
+            terms to 0, to 1, or to random numbers between -1 and 1.
+        seed: of the random numbers.
+    """
+    if start == "pre-step":
+        minimum = backend.minimise(
+            problem, flat_state(problem), ("d",), PairNoise(), model=PairModel.ISOMETRIC, settings=settings
+        )
+        first_order = minimum.state.first_order
+    elif start == "random":
+        first_order = np.random.default_rng(seed).uniform(-1.0, 1.0, (*problem.visible.shape, 2))
+    else:
+        first_order = np.full((*problem.visible.shape, 2), float(start == "ones"))
+    state = planar_state(problem, first_order)
     return with_closed_form_scale(problem, state, PairNoise(extrinsic=np.inf))
 
 

@@ -18,7 +18,7 @@ from connrsfm_graph.baselines import BASELINES
 from connrsfm_graph.config import as_dict
 from connrsfm_graph.errors import ComputationError
 from connrsfm_graph.image_graph import GraphConfig, ImageGraph, select_edges
-from connrsfm_graph.initialise import initialise, with_closed_form_scale
+from connrsfm_graph.initialise import Start, initialise, with_closed_form_scale
 from connrsfm_graph.integrate import IntegrationConfig, terms_of_depth
 from connrsfm_graph.problem import Problem, State, make_problem
 from connrsfm_graph.progress import Progress
@@ -45,6 +45,9 @@ class Config:
     """Which pairs of images are used."""
     warps: WarpConfig = field(default_factory=lambda: WarpConfig(model="gaussian_process"))
     """Image warps."""
+    start: Start = "pre-step"
+    """First-order terms at the start of the differential solve: the isometric pre-step's or, for ablations, all zero,
+    all one or random."""
     solve: SolveConfig = field(default_factory=SolveConfig)
     """Differential solve."""
     integrate: IntegrationConfig = field(default_factory=IntegrationConfig)
@@ -88,7 +91,7 @@ def reconstruct(
     problem = make_problem(image, visible, graph.edges, warps.jets, warps.weight * warps.valid)
     backend = make_backend(config.solve.backend)
     with progress.stage("pre-step"):
-        start = initialise(problem, backend, config.solve.levenberg)
+        start = initialise(problem, backend, config.solve.levenberg, config.start, config.seed)
     with progress.stage("solve"):
         solved = solve(problem, start, backend, config.solve, config.integrate, progress.update)
     refined = None
