@@ -38,7 +38,11 @@ SLOTS = {"d": ((0, 2), (6, 8)), "c": ((2, 5), (8, 11)), "b": ((5, 6), (11, 12)),
 
 @njit(cache=True)
 def pair_workspace():
-    """Scratch space of `pair_kernel`; one per thread."""
+    """Scratch space of `pair_kernel`, one per thread; for compiled callers (from Python: `pair_workspace.py_func`).
+
+    numba's cache may lose the type description of arrays that a function returns to Python when compiled callers have
+    brought a copy of the function of their own.
+    """
     return np.empty((2, 2, 3, 3)), np.empty((2, 2, 3, 3, 5))
 
 
@@ -183,7 +187,7 @@ class ConformalPair:
         self._columns = [slice(*columns) for end in (0, 1) for columns in _columns(active, end)]
         if "s" in active:
             self._columns.append(slice(12, 13))
-        self._workspace = pair_workspace()
+        self._workspace = pair_workspace.py_func()
         self._J = np.empty((ROWS, COLUMNS))
 
     def residual(self, *x: np.ndarray) -> np.ndarray:
