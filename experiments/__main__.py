@@ -1,0 +1,80 @@
+"""Tables and figures from one command: `python -m experiments all`, `quick`, or names.
+
+Every experiment writes NAME.csv, NAME.md and NAME.png into the results folder and goes on where it was interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from experiments import theorem
+from experiments.ablations import ABLATION, EDGES, ITERATIONS, STARTING_VALUES
+from experiments.missing import MISSING
+from experiments.real import FLAG, KINECT_PAPER, TSHIRT
+from experiments.study import Experiment, Options
+from experiments.summary import summarise
+from experiments.synthetic import MIXED, SPHERES
+from experiments.timing import PARALLEL, TIME
+
+TABLES: tuple[Experiment, ...] = (
+    SPHERES,
+    TSHIRT,
+    KINECT_PAPER,
+    ABLATION,
+    ITERATIONS,
+    STARTING_VALUES,
+    EDGES,
+    TIME,
+    PARALLEL,
+    MISSING,
+    FLAG,
+    MIXED,
+)
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+def verify_theorem(options: Options) -> None:
+    """The paper's numerical verification, see `experiments.theorem`."""
+    size = ["--pairs", "3"] if options.quick else []
+    theorem.main(["--out", str(options.out), *size])
+
+
+EXPERIMENTS: dict[str, Callable[[Options], None]] = {
+    "theorem": verify_theorem,
+    **{experiment.name: experiment for experiment in TABLES},
+    "summary": summarise,
+}
+"""By name, in the order in which `all` runs them; one more entry adds one."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line."""
+    parser = argparse.ArgumentParser(prog="python -m experiments", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument(
+        "names",
+        nargs="+",
+        choices=["all", "quick", *EXPERIMENTS],
+        metavar="NAME",
+        help=", ".join(["all", "quick", *EXPERIMENTS]),
+    )
+    parser.add_argument("--data", type=Path, default=DATA, help="folder of the real data sets (default: %(default)s)")
+    parser.add_argument("--out", type=Path, default=Path("results"), help="folder for results (default: %(default)s)")
+    given = parser.parse_args(arguments)
+    options = Options(given.data, given.out, quick="quick" in given.names)
+    if options.quick:
+        options = replace(options, out=given.out / "quick")
+    names = list(EXPERIMENTS) if {"all", "quick"} & set(given.names) else given.names
+    options.out.mkdir(parents=True, exist_ok=True)
+    start = time.perf_counter()
+    for name in names:
+        EXPERIMENTS[name](options)
+    print(f"{len(names)} experiments in {(time.perf_counter() - start) / 60:.1f} minutes, results in {options.out}")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,79 @@
+"""Ablations, all from configuration: stages, rounds of the schedule, starting values and the number of image pairs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from functools import partial
+
+from connrsfm_graph.reconstruct import Config, default_config
+from connrsfm_graph.synthetic import spheres
+from connrsfm_graph.tracks import Tracks, load_tracks
+from experiments.study import Case, Experiment, Options
+from experiments.synthetic import tracks_of
+from factors.noise import PairNoise
+
+PAPER, DEFAULT = default_config("paper"), default_config()
+LEVELS = {
+    "pre-step alone": replace(PAPER, solve=replace(PAPER.solve, schedule="none")),
+    "paper mode without pre-step": replace(PAPER, start="zeros"),
+    "paper mode": PAPER,
+    "joint, all rows": replace(DEFAULT, solve=replace(DEFAULT.solve, noise=PairNoise()), refinement=False),
+    "joint, metric rows": replace(
+        DEFAULT, solve=replace(DEFAULT.solve, noise=PairNoise(1.0, math.inf, math.inf)), refinement=False
+    ),
+    "joint, no second-order rows": replace(
+        DEFAULT, solve=replace(DEFAULT.solve, noise=replace(DEFAULT.solve.noise, extrinsic=math.inf)), refinement=False
+    ),
+    "joint": replace(DEFAULT, refinement=False),
+    "pre-step, refined": replace(DEFAULT, solve=replace(DEFAULT.solve, schedule="none")),
+    "default": DEFAULT,
+}
+"""From the pre-step alone to everything."""
+ROUNDS = {str(n): replace(PAPER, solve=replace(PAPER.solve, outer_iterations=n)) for n in range(1, 6)}
+STARTS = {
+    f"{mode}, {start}": replace(config, start=start)
+    for mode, config in (("paper mode", PAPER), ("default", DEFAULT))
+    for start in ("pre-step", "zeros", "ones", "random")
+}
+PAIRS = {
+    f"{mode}, {extra}": replace(config, graph=replace(config.graph, extra_per_frame=extra))
+    for mode, config in (("paper mode", PAPER), ("default", DEFAULT))
+    for extra in (0.0, 0.5, 1.0, 2.0, 4.0)
+}
+
+
+def _data_sets(options: Options) -> Iterable[tuple[str, int, partial[Tracks]]]:
+    """Spheres of every seed, and the T-shirt where it is."""
+    for seed in options.seeds():
+        yield "spheres", seed, partial(tracks_of, spheres, seed)
+    if (options.data / "tshirt.npz").exists():
+        yield "T-shirt", 0, partial(load_tracks, options.data / "tshirt.npz")
+
+
+def _cases(column: str, settings: Mapping[str, Config], options: Options) -> Iterable[Case]:
+    for data, seed, tracks in _data_sets(options):
+        for name, config in settings.items():
+            yield Case({"data": data, column: name, "seed": seed}, tracks, config=replace(config, seed=seed))
+
+
+def _by_mode(column: str, settings: Mapping[str, Config], options: Options) -> Iterable[Case]:
+    for case in _cases(column, settings, options):
+        mode, value = str(case.keys[column]).split(", ")
+        yield replace(case, keys={"data": case.keys["data"], "mode": mode, column: value, "seed": case.keys["seed"]})
+
+
+ABLATION = Experiment("ablation", "What each stage adds", partial(_cases, "stages", LEVELS))
+ITERATIONS = Experiment(
+    "iterations", "Rounds N_t of the separable schedule, paper mode", partial(_cases, "N_t", ROUNDS), x="N_t"
+)
+STARTING_VALUES = Experiment(
+    "starting_values", "First-order terms at the start", partial(_by_mode, "start", STARTS), x="start"
+)
+EDGES = Experiment(
+    "edges",
+    "Image pairs beside the spanning tree, per image",
+    partial(_by_mode, "extra per image", PAIRS),
+    x="extra per image",
+)
