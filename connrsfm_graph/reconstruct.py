@@ -30,6 +30,7 @@ from connrsfm_graph.solvers.interface import Backend
 from connrsfm_graph.solvers.separable import SolveConfig, Solved, solve
 from connrsfm_graph.tracks import Tracks
 from connrsfm_graph.warps import WarpConfig, Warps, estimate_pixel_noise, fit_warps
+from connrsfm_graph.warps.cycles import cycle_agreement
 from factors.noise import PairNoise
 from factors.surface import PERSPECTIVE, normals
 
@@ -182,10 +183,16 @@ def _record(
     warnings = [f"warp from image {a} to image {b}: {problem}" for (a, b), problem in problems[:5]]
     if len(problems) > 5:
         warnings.append(f"{len(problems) - 5} more warps had problems")
+    cycles = cycle_agreement(warps)
+    suspects = cycles.suspects()
+    if len(suspects):
+        pairs = ", ".join(f"{a}-{b}" for a, b in warps.edges[suspects[:5]])
+        warnings.append(f"{len(suspects)} warps disagree with the others around cycles of the image graph ({pairs})")
     decisions = {
         "warp model": sorted({report.model for report in warps.reports}),
         "edges": {"tree": graph.n_tree, "extra": len(graph.edges) - graph.n_tree},
-        "warp residual in pixels (median)": float(np.median(warps.residual)) * tracks.focal_length(),
+        "disagreement of warps around triangles (median)": _median(cycles.disagreement),
+        "warp residual in pixels (median)": (_median(warps.residual) or 0.0) * tracks.focal_length(),
         "integration bending weight": solved.integrated.bending,
         "convergence index": solved.index_history,
         "scale convention": "each image is scaled so that the median conformal scale of the edges is 1",
@@ -208,3 +215,8 @@ def _record(
         peak_memory_mib=peak_memory_mib(),
         versions=package_versions(),
     )
+
+
+def _median(values: np.ndarray) -> float | None:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else None
