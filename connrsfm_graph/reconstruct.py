@@ -138,6 +138,8 @@ def _surfaces(
     else:
         points, log_depth = refined.points, refined.log_depth
         recovered = np.isfinite(points).all(axis=-1)
+        if not (points[recovered][:, 2] > 0).all():
+            raise ComputationError("the refinement left points without depth; check the tracks for gross errors")
         image = np.where(recovered[..., None], points[..., :2] / points[..., 2:], 0.0)
         first, second = terms_of_depth(image, log_depth, recovered, problem.camera)
         depth_std, log_factor, outlier = refined.depth_std, refined.log_factor, refined.outlier

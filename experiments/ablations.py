@@ -45,10 +45,10 @@ PAIRS = {
 
 
 def _data_sets(options: Options) -> Iterable[tuple[str, int, partial[Tracks]]]:
-    """Spheres of every seed, and the T-shirt where it is."""
+    """Spheres of every seed, and the T-shirt where it is and time allows."""
     for seed in options.seeds():
         yield "spheres", seed, partial(tracks_of, spheres, seed)
-    if (options.data / "tshirt.npz").exists():
+    if (options.data / "tshirt.npz").exists() and not options.quick:
         yield "T-shirt", 0, partial(load_tracks, options.data / "tshirt.npz")
 
 

@@ -34,14 +34,11 @@ def _parallel(options: Options) -> Iterable[Case]:
             yield Case(keys, partial(_tracks, *size), method, config, threads)
 
 
-TIME = Experiment(
-    "time", f"Seconds against images, {POINTS} points", _time, x="images", measure="seconds", warm_up=True
-)
+TIME = Experiment("time", f"Seconds against images, {POINTS} points", _time, x="images", measure="seconds")
 PARALLEL = Experiment(
     "parallel",
     f"Threads, {THREADS_FRAMES} images of {THREADS_POINTS} points",
     _parallel,
     x="threads",
     measure="seconds",
-    warm_up=True,
 )
