@@ -8,13 +8,16 @@ import numpy as np
 from connrsfm_graph.errors import InputError
 from connrsfm_graph.metrics.alignment import align_similarity
 from connrsfm_graph.slam.assemble import pose_key
-from connrsfm_graph.slam.sightings import Sightings
+from connrsfm_graph.slam.sightings import FusionNoise, Sightings
 from factors.keys import RIGID_LANDMARK, VIEW_SCALE, key
 
 _FEWEST = 4
-"""Shared points from which the motion between two views is taken from the surface."""
-_DISTANCE_WEIGHT = 1e-3
-"""Weight of the guess of a landmark's place against the rays that see it."""
+"""Shared points from which the pose of a view is taken from the surface."""
+_RENEWAL = 0.1
+"""Share of the newest view in the running mean of the surface."""
+_GUESS_WEIGHT = 1.0
+"""Weight of the guess of a landmark's place, in rays. Poses from odometry turn too much for their rays to be trusted:
+a start behind a camera has no way out, one at a wrong distance has."""
 LANDMARK_HUBER = 3.0
 """Landmarks beyond this many standard deviations of the image noise count linearly."""
 
@@ -80,7 +83,7 @@ def nearest_point(poses: list[gtsam.Pose3], image: np.ndarray, distance: float) 
     """
     rays = [pose.rotation().matrix() @ np.array([*x, 1.0]) for pose, x in zip(poses, image, strict=True)]
     guess = poses[0].translation() + distance * rays[0]
-    A, y = _DISTANCE_WEIGHT * np.eye(3), _DISTANCE_WEIGHT * guess
+    A, y = _GUESS_WEIGHT * np.eye(3), _GUESS_WEIGHT * guess
     for pose, ray in zip(poses, rays, strict=True):
         across = np.eye(3) - np.outer(ray, ray) / (ray @ ray)
         A = A + across
@@ -90,54 +93,97 @@ def nearest_point(poses: list[gtsam.Pose3], image: np.ndarray, distance: float) 
 
 
 def start_cameras(
-    sightings: Sightings, steps: np.ndarray | None = None, first: np.ndarray | None = None
+    sightings: Sightings,
+    noise: FusionNoise,
+    steps: np.ndarray | None = None,
+    sigmas: np.ndarray | None = None,
+    first: np.ndarray | None = None,
 ) -> gtsam.Values:
-    """Poses and scales to start from: every view fitted to the one before as if the surface were rigid.
+    """Poses and scales of all views to start from.
 
-    Odometry gives the unit of length (the median ratio of its steps to the fitted ones) and the steps of views that
-    share fewer than four points with the view before.
+    With odometry its steps are chained and one scale for all views is found (`common_scale`). Without, every view is
+    fitted as if it were rigid onto the running mean of where the views before put its points.
 
     Args:
-        sightings: the reconstruction.
-        steps: (F-1, 4, 4) odometry, or None.
+        sightings, noise: the reconstruction.
+        steps, sigmas: odometry as in `add_odometry`, or None.
         first: (4, 4) pose of the first view; the origin of the world where None.
 
     Raises:
-        InputError: neighbouring views share fewer than four points and there is no odometry.
+        InputError: there is no odometry and a view shares fewer than four points with those before.
     """
-    points = sightings.points()
-    fitted: list[tuple[float, np.ndarray] | None] = []
-    for a in range(sightings.n_views - 1):
-        shared = sightings.seen[a] & sightings.seen[a + 1]
-        if shared.sum() >= _FEWEST:
-            scale, R, t = align_similarity(points[a + 1, shared], points[a, shared])
-            fitted.append((scale, np.block([[R, t[:, None]], [np.zeros(3), 1.0]])))
-        elif steps is not None:
-            fitted.append(None)
-        else:
-            raise InputError(
-                f"views {a} and {a + 1} share {shared.sum()} points, expected {_FEWEST}; give odometry, or leave one out"
-            )
-    unit = 1.0
-    if steps is not None:
-        pairs = [(steps[a, :3, 3], fit[1][:3, 3]) for a, fit in enumerate(fitted) if fit is not None]
-        ratios = [np.linalg.norm(x) / np.linalg.norm(y) for x, y in pairs if np.linalg.norm(y) > 0]
-        unit = float(np.median(ratios)) if ratios and np.median(ratios) > 0 else 1.0
+    poses = np.tile(np.eye(4) if first is None else np.asarray(first, dtype=float), (sightings.n_views, 1, 1))
+    if steps is None or sigmas is None:
+        log_scale = _chain_by_surface(sightings, poses)
+    else:
+        for view, step in enumerate(steps):
+            poses[view + 1] = poses[view] @ step
+        drift = float(np.sqrt((sigmas[:, :3] ** 2).mean()))
+        log_scale = np.full(len(poses), common_scale(sightings, poses, noise, drift))
     values = gtsam.Values()
-    pose, log_scale = np.eye(4) if first is None else np.asarray(first, dtype=float), np.log(unit)
-    for view in range(sightings.n_views):
+    for view, pose in enumerate(poses):
         values.insert(pose_key(view), gtsam.Pose3(pose))
-        values.insert(key(VIEW_SCALE, 0, view), np.array([log_scale]))
-        if view == len(fitted):
-            break
-        fit = fitted[view]
-        if fit is None:
-            assert steps is not None
-            step = steps[view]
-        else:
-            ratio, step = fit
-            step = step.copy()
-            step[:3, 3] *= np.exp(log_scale)
-            log_scale += np.log(ratio)
-        pose = pose @ step
+        values.insert(key(VIEW_SCALE, 0, view), log_scale[view : view + 1])
     return values
+
+
+def common_scale(sightings: Sightings, poses: np.ndarray, noise: FusionNoise, drift: float) -> float:
+    """Log scale, the same for all views, at which the surface moves least in the world.
+
+    Between views a and b at some distance in time a point moves by X_b - X_a + (t_b - t_a) / s in units of the
+    reconstruction (X along the axes of the world). That is linear in 1 / s and in the error of the rotation between
+    the views, which is estimated too.
+
+    Args:
+        sightings, noise: the reconstruction.
+        poses: (F, 4, 4).
+        drift: standard deviation of the poses' rotation error per view, radians; it grows with the root of time.
+
+    Returns:
+        log s; 0 where the camera does not move far enough to tell.
+    """
+    F = sightings.n_views
+    lag = max(1, F // 4)
+    points = np.einsum("fij,fpj->fpi", poses[:, :3, :3], sightings.points())
+    distance = float(np.median(points[sightings.seen] ** 2) ** 0.5)
+    information = max(drift * lag**0.5, 1e-9) ** -2.0 * (lag * noise.motion**2 + 2.0 * (noise.depth * distance) ** 2)
+    across, along = 0.0, 0.0
+    for a in range(F - lag):
+        shared = sightings.seen[a] & sightings.seen[a + lag]
+        source, target = points[a, shared], points[a + lag, shared]
+        if not shared.any():
+            continue
+        turn = np.concatenate([_cross(x) for x in target])
+        moved = (target - source).ravel()
+        baseline = np.tile(poses[a + lag, :3, 3] - poses[a, :3, 3], len(target))
+        normal = turn.T @ turn + information * np.eye(3)
+        baseline = baseline - turn @ np.linalg.solve(normal, turn.T @ baseline)
+        across -= float(baseline @ moved)
+        along += float(baseline @ baseline)
+    return float(np.log(along / across)) if across > 1e-6 * along > 0.0 else 0.0
+
+
+def _cross(x: np.ndarray) -> np.ndarray:
+    return np.array([[0.0, -x[2], x[1]], [x[2], 0.0, -x[0]], [-x[1], x[0], 0.0]])
+
+
+def _chain_by_surface(sightings: Sightings, poses: np.ndarray) -> np.ndarray:
+    """Fill in poses from the first on; returns the log scales (F,)."""
+    points = sightings.points()
+    log_scale = np.zeros(len(poses))
+    mean = np.zeros((sightings.n_points, 3))
+    known = np.zeros(sightings.n_points, dtype=bool)
+    for view, seen in enumerate(sightings.seen):
+        shared = seen & known
+        if view and shared.sum() < _FEWEST:
+            raise InputError(
+                f"view {view} shares {shared.sum()} points with the views before, expected {_FEWEST}; "
+                "give odometry, or leave it out"
+            )
+        if view:
+            scale, R, t = align_similarity(points[view, shared], mean[shared])
+            poses[view, :3, :3], poses[view, :3, 3], log_scale[view] = R, t, np.log(scale)
+        world = np.exp(log_scale[view]) * points[view] @ poses[view, :3, :3].T + poses[view, :3, 3]
+        mean = np.where((seen & known)[:, None], mean + _RENEWAL * (world - mean), np.where(seen[:, None], world, mean))
+        known |= seen
+    return log_scale

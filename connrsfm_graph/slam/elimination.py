@@ -1,9 +1,8 @@
 """Anchors, depths and motions of a whole map at once: linearised in batch and eliminated onto the cameras.
 
 The same cost as the factors of `assemble`, point by point. The log depth of a sighting is in one anchor and one prior
-and is eliminated first; what is left of the point is a chain of map points with a banded matrix A, whose couplings E to
-the cameras reach only the camera of each sighting and the scales of its neighbours. The cameras' normal equations get
--E^T A^-1 E. Seven columns per camera, pose and log scale; dense, since every point couples all views that see it.
+and is eliminated first; what is left of the point is a chain of map points (`chain`), whose couplings E to the cameras reach
+only the camera of each sighting and the scales of its neighbours. The cameras' normal equations get -E^T A^-1 E. Seven columns per camera, pose and log scale; dense, since every point couples all views that see it.
 """
 
 from __future__ import annotations
@@ -11,10 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
-from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from connrsfm_graph.slam.assemble import MapModel
+from connrsfm_graph.slam.chain import factorise, solve, subtract_coupling
 from connrsfm_graph.slam.sightings import FusionNoise, Sightings
 from factors.camera_anchor import DEPTH, POINT, linearise_anchors
 from factors.map_motion import motion_coefficients, motion_variance, scale_view
@@ -49,8 +47,8 @@ class Reduced:
     """(7 F, 7 F)"""
     gradient: np.ndarray
     """(7 F,)"""
-    chains: list[np.ndarray]
-    """Banded Cholesky factor of every point's chain."""
+    chains: tuple[np.ndarray, np.ndarray, np.ndarray]
+    """Starts, inverse blocks and recursion of all chains, see `chain.factorise`."""
     coupling: np.ndarray
     """(N, 3, 9)"""
     columns: np.ndarray
@@ -60,13 +58,11 @@ class Reduced:
     depth_rows: tuple[np.ndarray, np.ndarray, np.ndarray]
     """Of every sighting: coupling of the depth to (camera, map point) (N, 10), gradient (N,), diagonal (N,)."""
 
-    def back_substitute(self, cameras: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def back_substitute(self, cameras: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Steps of depths (N,) and map points (N, 3) for a step of the cameras (7 F,)."""
         padded = np.append(cameras, 0.0)
         right = -(self.point_gradient + np.einsum("nij,nj->ni", self.coupling, padded[self.columns]))
-        points = np.empty_like(right)
-        for factor, first, last in zip(self.chains, starts[:-1], starts[1:], strict=True):
-            points[first:last] = cho_solve_banded((factor, True), right[first:last].ravel()).reshape(-1, 3)
+        points = solve(*self.chains, right)
         rows, gradient, diagonal = self.depth_rows
         moved = np.concatenate([padded[self.columns[:, :CAMERA]], points], axis=1)
         return -(gradient + (rows * moved).sum(axis=1)) / diagonal, points
@@ -154,7 +150,7 @@ class MapTerms:
         # Motion: between the map points of a window, and with the scale that gives its unit.
         motion, unit = self._motion(state)
         size = self.window.shape[1]
-        off = np.zeros((size, N))  # off[d, n]: couples sightings n and n + d
+        off = np.zeros((3, N))  # off[d, n]: couples sightings n and n + d
         square = self.motion_weight * (motion**2).sum(axis=1)
         scale_views = self.view[self.window[:, self.unit_row]]
         np.add.at(H, (scale_views, CAMERA - 1, CAMERA - 1), square)
@@ -171,21 +167,18 @@ class MapTerms:
         hessian = np.zeros((CAMERA * self.n_views, CAMERA * self.n_views))
         reduced = np.zeros(CAMERA * self.n_views + 1)
         reduced[:-1] = h.ravel()
-        chains = []
-        for first, last in zip(self.starts[:-1], self.starts[1:], strict=True):
-            factor = cholesky_banded(_banded(blocks[first:last], off[:, first:last]), lower=True)
-            inverse = cho_solve_banded((factor, True), np.eye(3 * (last - first)))
-            part, columns = coupling[first:last], self.columns[first:last]
-            _eliminate(inverse, part, columns, hessian)
-            pulled = cho_solve_banded((factor, True), point_gradient[first:last].ravel()).reshape(-1, 3)
-            np.add.at(reduced, columns, -np.einsum("nij,ni->nj", part, pulled))
-            chains.append(factor)
+        inverse, W = np.empty((N, 3, 3)), np.empty((2, N, 3, 3))
+        if not factorise(self.starts, blocks, off[1:], inverse, W):
+            raise np.linalg.LinAlgError("the chain of a map point is not positive definite")
+        subtract_coupling(self.starts, inverse, W, coupling, self.columns, hessian)
+        pulled = np.einsum("nij,ni->nj", coupling, solve(self.starts, inverse, W, point_gradient))
+        np.add.at(reduced, self.columns, -pulled)
         hessian += hessian.T
         for view in range(self.n_views):
             block = slice(CAMERA * view, CAMERA * (view + 1))
             hessian[block, block] += H[view]
         depth_rows = (rows, gradient, diagonal)
-        return Reduced(hessian, reduced[:-1], chains, coupling, self.columns, point_gradient, depth_rows)
+        return Reduced(hessian, reduced[:-1], (self.starts, inverse, W), coupling, self.columns, point_gradient, depth_rows)
 
     def _anchors(self, state: MapState) -> tuple[np.ndarray, np.ndarray]:
         view = self.view
@@ -195,40 +188,3 @@ class MapTerms:
         """Residuals (M, 3) of the windows and their units exp(-g) (M,)."""
         unit = np.exp(-state.g[self.view[self.window[:, self.unit_row]]])
         return unit[:, None] * np.einsum("mk,mki->mi", self.coefficients, state.m[self.window]), unit
-
-
-def _banded(blocks: np.ndarray, off: np.ndarray) -> np.ndarray:
-    """Lower band of a chain's matrix: 3 x 3 blocks on the diagonal, multiples of the identity beside it."""
-    n = len(blocks)
-    band = np.zeros((3 * len(off), 3 * n))
-    for i in range(3):
-        for j in range(i + 1):
-            band[i - j, j::3] = blocks[:, i, j]
-    for d in range(1, len(off)):
-        band[3 * d] = np.repeat(off[d], 3)
-    return band
-
-
-@njit(cache=True)
-def _eliminate(inverse, coupling, columns, hessian):
-    """Subtract half of E^T A^-1 E from `hessian`, so that its sum with its transpose holds the whole."""
-    n = len(columns)
-    left = np.empty((3, _COUPLED))
-    for k in range(n):
-        for l in range(k, n):
-            share = 0.5 if k == l else 1.0
-            for i in range(3):
-                for c in range(_COUPLED):
-                    total = 0.0
-                    for j in range(3):
-                        total += inverse[3 * k + i, 3 * l + j] * coupling[l, j, c]
-                    left[i, c] = share * total
-            for a in range(_COUPLED):
-                row = columns[k, a]
-                if row < 0:
-                    continue
-                e0, e1, e2 = coupling[k, 0, a], coupling[k, 1, a], coupling[k, 2, a]
-                for c in range(_COUPLED):
-                    column = columns[l, c]
-                    if column >= 0:
-                        hessian[row, column] -= e0 * left[0, c] + e1 * left[1, c] + e2 * left[2, c]

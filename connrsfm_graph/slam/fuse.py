@@ -21,6 +21,7 @@ from connrsfm_graph.errors import ComputationError, InputError
 from connrsfm_graph.slam.assemble import MapModel, link_scales, pose_key
 from connrsfm_graph.slam.elimination import CAMERA, MapState, MapTerms, Reduced
 from connrsfm_graph.slam.sightings import FusionNoise, Sightings
+from connrsfm_graph.solvers.gtsam_backend import levenberg_marquardt
 from connrsfm_graph.solvers.interface import MAX_DAMPING, MIN_DAMPING, Levenberg
 from factors.keys import CAMERA_POSE, LOG_DEPTH, MAP_POINT, VIEW_SCALE, decode, describe, key
 
@@ -99,6 +100,8 @@ def fuse(
     rest = _with_gauge(graph, values, sightings, noise)
     cameras = [k for view in range(sightings.n_views) for k in (pose_key(view), key(VIEW_SCALE, 0, view))]
     start = _start_values(rest, values, cameras)
+    # What is known without the map first: a landmark that cameras turn away from must not pull at the surface.
+    start, _, _ = levenberg_marquardt(rest, start, config.levenberg)
     terms = MapTerms(sightings, noise, config.map)
     state = terms.start(*_cameras(start, sightings.n_views))
     columns = _Columns(rest, start, cameras)
@@ -179,7 +182,7 @@ def _step(
     """State and values after one damped Gauss-Newton step."""
     reduced, normal, right = _joined(terms, state, columns, hessian, gradient, damping)
     step = cho_solve(cho_factor(normal, lower=True, overwrite_a=True), -right)
-    depths, points = reduced.back_substitute(step[: columns.n_cameras], terms.starts)
+    depths, points = reduced.back_substitute(step[: columns.n_cameras])
     trial = values.retract(columns.vectors(step))
     return MapState(*_cameras(trial, terms.n_views), state.b + depths, state.m + points), trial
 

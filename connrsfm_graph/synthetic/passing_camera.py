@@ -1,8 +1,8 @@
 """A camera that passes a waving sheet before a rigid background, with the truth of everything in one world frame.
 
 World: x right, y down, z away from the cameras; the sheet waves about the plane z = 0, the background stands behind
-it. The sheet never stretches: waves run along it, and its points are integrated along its arc. The camera passes at a
-distance of about 3 with its eyes on the sheet. One time step is one view.
+it. The sheet never stretches: waves run along it, and its points are integrated along its arc. The camera passes in a
+bow at a distance of about 3 with its eyes on the sheet. One time step is one view.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def passing_camera(
     n_points: int = 150,
     n_background: int = 60,
     swing: float = 0.5,
-    length: float = 3.0,
+    bow_deg: float = 70.0,
     seed: int = 0,
 ) -> PassingScene:
     """Simulate a scene.
@@ -58,14 +58,14 @@ def passing_camera(
     Args:
         n_frames, n_points, n_background: F, P and B.
         swing: largest slope angle of the waves in radians; 0 gives a rigid sheet.
-        length: of the camera's path.
+        bow_deg: angle of the camera's path, seen from the sheet.
         seed: of the points' places.
     """
     rng = np.random.default_rng(seed)
     sheet = rng.uniform(-_SHEET, _SHEET, (n_points, 2))
     time = np.linspace(0.0, 1.0, n_frames)
     points = np.stack([_waving(sheet, swing, moment * n_frames / 40.0) for moment in time])
-    poses = _path(time, length)
+    poses = _path(time, np.radians(bow_deg))
     background = np.column_stack(
         [rng.uniform(-4.0, 4.0, n_background), rng.uniform(-2.5, 2.5, n_background), rng.uniform(1.0, 3.0, n_background)]
     )
@@ -133,11 +133,10 @@ def _integral(values: np.ndarray, arc: np.ndarray) -> np.ndarray:
     return total - total.mean()
 
 
-def _path(time: np.ndarray, length: float) -> np.ndarray:
-    """Poses (F, 4, 4) of a camera that passes along x, nods a little and looks at the sheet's middle."""
-    centre = np.column_stack(
-        [length * (time - 0.5), 0.25 * np.sin(7.0 * time), -3.0 + 0.3 * np.sin(5.0 * time)],
-    )
+def _path(time: np.ndarray, bow: float) -> np.ndarray:
+    """Poses (F, 4, 4) of a camera that passes in a bow, nods a little and looks at the sheet's middle."""
+    angle, distance = bow * (time - 0.5), 3.0 + 0.3 * np.sin(5.0 * time)
+    centre = np.column_stack([distance * np.sin(angle), 0.25 * np.sin(7.0 * time), -distance * np.cos(angle)])
     forward = np.column_stack([0.1 * np.sin(9.0 * time), 0.1 * np.cos(11.0 * time), np.zeros_like(time)]) - centre
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
     right = np.cross([0.0, 1.0, 0.0], forward)
