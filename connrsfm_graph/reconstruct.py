@@ -44,7 +44,7 @@ class Config:
 
     graph: GraphConfig = field(default_factory=GraphConfig)
     """Which pairs of images are used."""
-    warps: WarpConfig = field(default_factory=lambda: WarpConfig(model="gaussian_process"))
+    warps: WarpConfig = field(default_factory=WarpConfig)
     """Image warps."""
     start: Start = "pre-step"
     """First-order terms at the start of the differential solve: the isometric pre-step's or, for ablations, all zero,
