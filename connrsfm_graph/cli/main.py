@@ -20,7 +20,7 @@ COMMANDS = (demo, track, reconstruct, evaluate, report, settings)
 def main(argv: Sequence[str] | None = None) -> int:
     """Run `connrsfm` with these arguments (the process's own where None) and return the exit status."""
     try:
-        arguments = _parser().parse_args(argv)
+        arguments = build_parser().parse_args(argv)
     except SystemExit as stop:  # argparse has printed help or what is wrong
         return int(stop.code or 0)
     try:
@@ -45,7 +45,8 @@ class _Parser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: {message}; see {self.prog} --help\n")
 
 
-def _parser() -> argparse.ArgumentParser:
+def build_parser() -> argparse.ArgumentParser:
+    """All commands and their options."""
     parser = _Parser(
         prog="connrsfm",
         description="Surface of every image of a deforming object, and the conformal scale between images, from point "
