@@ -8,9 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
     from experiments.study import Experiment, Group
 
-LABELS = {"e3d_percent": "3D error, percent", "shape_error_deg": "shape error, degrees", "seconds": "seconds"}
+LABELS = {"e3d_percent": "3D error, percent", "seconds": "seconds"}
+FLOOR = 1e-3
+"""Smaller values are drawn as this; they are exact for all purposes."""
 
 
 def draw(experiment: Experiment, groups: Sequence[Group], path: Path) -> None:
@@ -23,25 +27,28 @@ def draw(experiment: Experiment, groups: Sequence[Group], path: Path) -> None:
     groups = [each for each in groups if each.runs]
     if not groups:
         return
-    figure, axes = plt.subplots(figsize=(8.0, 4.5), constrained_layout=True)
+    figure, axes = plt.subplots(figsize=(8.0, max(4.5, 0.22 * len(groups) * (experiment.x is None))))
     if experiment.x is None:
         _bars(axes, experiment.measure, groups)
     else:
         _lines(axes, experiment.x, experiment.measure, groups)
-    axes.set(ylabel=LABELS[experiment.measure], yscale="log")
     axes.set_title(experiment.title, fontsize=10)
-    axes.grid(axis="y", which="both", alpha=0.3)
-    figure.savefig(path, dpi=150)
+    axes.grid(axis="x" if experiment.x is None else "y", alpha=0.3)
+    figure.tight_layout()
+    figure.savefig(path, dpi=120)
     plt.close(figure)
 
 
-def _bars(axes, measure: str, groups: Sequence[Group]) -> None:
+def _bars(axes: Axes, measure: str, groups: Sequence[Group]) -> None:
     names = [", ".join(each.keys.values()) for each in groups]
-    axes.bar(names, [each.mean[measure] for each in groups], yerr=[each.spread[measure] for each in groups], capsize=2)
-    axes.tick_params(axis="x", labelrotation=60, labelsize=7)
+    spread = [each.spread[measure] for each in groups]
+    axes.barh(names, [_drawn(each, measure) for each in groups], xerr=spread, capsize=2)
+    axes.invert_yaxis()
+    axes.tick_params(axis="y", labelsize=7)
+    axes.set(xlabel=LABELS[measure], xscale="log")
 
 
-def _lines(axes, x: str, measure: str, groups: Sequence[Group]) -> None:
+def _lines(axes: Axes, x: str, measure: str, groups: Sequence[Group]) -> None:
     """One line for every combination of the other keys; numbers keep their distances, other values their order."""
     series: dict[str, list[Group]] = {}
     for each in groups:
@@ -50,12 +57,16 @@ def _lines(axes, x: str, measure: str, groups: Sequence[Group]) -> None:
     numeric = all(_is_number(place) for place in places)
     for name, members in series.items():
         at = [float(each.keys[x]) if numeric else places.index(each.keys[x]) for each in members]
-        mean = [each.mean[measure] for each in members]
-        axes.errorbar(at, mean, [each.spread[measure] for each in members], marker="o", capsize=2, label=name)
+        spread = [each.spread[measure] for each in members]
+        axes.errorbar(at, [_drawn(each, measure) for each in members], spread, marker="o", capsize=2, label=name)
     if not numeric:
         axes.set_xticks(range(len(places)), places)
-    axes.set_xlabel(x)
+    axes.set(xlabel=x, ylabel=LABELS[measure], yscale="log")
     axes.legend(fontsize=7)
+
+
+def _drawn(each: Group, measure: str) -> float:
+    return max(each.mean[measure], FLOOR)
 
 
 def _is_number(text: str) -> bool:

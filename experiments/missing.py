@@ -18,7 +18,7 @@ def _tracks(share: int, seed: int) -> Tracks:
 
 
 def _cases(options: Options) -> Iterable[Case]:
-    for share in SHARES[::2] if options.quick else SHARES:
+    for share in SHARES[2:3] if options.quick else SHARES:
         for seed in options.seeds():
             for name, (method, config) in VARIANTS.items():
                 keys = {"missing %": share, "method": name, "seed": seed}

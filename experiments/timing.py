@@ -19,7 +19,7 @@ def _tracks(n_frames: int, n_points: int) -> Tracks:
 
 
 def _time(options: Options) -> Iterable[Case]:
-    for n_frames in FRAMES[:2] if options.quick else FRAMES:
+    for n_frames in FRAMES[:1] if options.quick else FRAMES:
         for name in ("default", "paper mode", "infp", "go20", "mdh"):
             method, config = VARIANTS[name]
             yield Case({"images": n_frames, "method": name}, partial(_tracks, n_frames, POINTS), method, config)
@@ -34,10 +34,10 @@ def _parallel(options: Options) -> Iterable[Case]:
             yield Case(keys, partial(_tracks, *size), method, config, threads)
 
 
-TIME = Experiment("time", f"Seconds against images, {POINTS} points", _time, x="images", measure="seconds")
+TIME = Experiment("time", "Seconds against images", _time, x="images", measure="seconds")
 PARALLEL = Experiment(
     "parallel",
-    f"Threads, {THREADS_FRAMES} images of {THREADS_POINTS} points",
+    "Threads",
     _parallel,
     x="threads",
     measure="seconds",

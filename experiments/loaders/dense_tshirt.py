@@ -1,0 +1,13 @@
+"""dense Kinect T-shirt, 313 images."""
+
+from __future__ import annotations
+
+from experiments.loaders import Dataset
+from experiments.loaders._stacked import load_stacked
+
+DATASET = Dataset(
+    "dense Kinect T-shirt, 313 images",
+    "Varol, Salzmann, Fua, Urtasun, CVPR 2012 (EPFL CVLab); tracks from Kumar, Cherian, Dai, Li, CVPR 2018",
+    "one .mat file with W and GT",
+    load_stacked,
+)
