@@ -10,7 +10,7 @@ with the true first-order terms only, the second-order ones set to zero, and wit
 
     python -m experiments.theorem --out DIR
 
-prints the table and writes theorem.csv (one line per pair and point) and theorem.png. Needs matplotlib.
+prints the table and writes theorem.csv (one line per pair and point), theorem.md and theorem.png. Needs matplotlib.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ def write_plot(index: np.ndarray, path: Path) -> None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--out", type=Path, required=True, help="folder for theorem.csv and theorem.png")
+    parser.add_argument("--out", type=Path, required=True, help="folder for theorem.csv, .md and .png")
     parser.add_argument("--pairs", type=int, default=10, help="number of ball pairs")
     parser.add_argument("--points", type=int, default=100, help="points on each pair")
     parser.add_argument("--seed", type=int, default=0)
@@ -121,7 +121,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options.out.mkdir(parents=True, exist_ok=True)
     write_csv(index, options.out / "theorem.csv")
     write_plot(index, options.out / "theorem.png")
-    print(table(index))
+    text = f"### Theorem 1 on ball pairs\n\n```\n{table(index)}\n```\n"
+    (options.out / "theorem.md").write_text(text, encoding="utf-8")
+    print(text)
     return 0
 
 

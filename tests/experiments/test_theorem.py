@@ -54,3 +54,4 @@ def test_the_script_writes_table_and_plot(tmp_path: Path, capsys: pytest.Capture
     assert len(rows) == 1 + 2 * 20
     assert max(float(row[3]) for row in rows[1:]) < 1e-10
     assert (tmp_path / "new" / "theorem.png").stat().st_size > 10_000
+    assert theorem.table(theorem.verify(2, 20)) in (tmp_path / "new" / "theorem.md").read_text()
