@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -190,7 +190,7 @@ def _record(
     if len(suspects):
         pairs = ", ".join(f"{a}-{b}" for a, b in warps.edges[suspects[:5]])
         warnings.append(f"{len(suspects)} warps disagree with the others around cycles of the image graph ({pairs})")
-    decisions = {
+    decisions: dict[str, Any] = {
         "warp model": sorted({report.model for report in warps.reports}),
         "edges": {"tree": graph.n_tree, "extra": len(graph.edges) - graph.n_tree},
         "disagreement of warps around triangles (median)": _median(cycles.disagreement),
