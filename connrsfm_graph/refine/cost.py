@@ -13,13 +13,10 @@ import numpy as np
 from numba import njit
 
 from factors.bending import hinge_coefficients
-from factors.edge_length import arc_offset, log_chord_kernel
+from factors.edge_length import log_chord_kernel
 
 BENDING_CAP = 6.0
 """A hinge's coefficients are scaled down to at most this times their median: slivers carry no curvature."""
-
-QUADRIC_RIDGE = 1e-2
-"""Keeps the quadric about a vertex flat where it has too few neighbours to show its curvature."""
 
 
 class Weights(NamedTuple):
@@ -31,10 +28,27 @@ class Weights(NamedTuple):
     """Of the hinge residual; 0 switches bending off."""
     smoothness: float
     """Of differences of the log conformal factor over near edges."""
-    factor: float
-    """Of the log conformal factor itself; weak, it fixes the mean."""
+    drift: float
+    """Of log depths about their start; weak, it keeps points that nothing else holds from leaving for infinity."""
     unit: float
     """Of the mean log length; it fixes the unit of length."""
+
+
+class Terms(NamedTuple):
+    """What is common to all views: the mesh's terms and their shared variables."""
+
+    edges: np.ndarray
+    """(E, 2)."""
+    n_near: int
+    """The first edges, also those of the scale's smoothness."""
+    hinges: np.ndarray
+    """(H, 4)."""
+    stencils: np.ndarray
+    """(H, 4) hinge coefficients."""
+    log_length: np.ndarray
+    """(E,) latent log lengths."""
+    weights: Weights
+    """See there."""
 
 
 @njit(cache=True)
@@ -58,26 +72,26 @@ def hinge_stencils(length, hinge_edges, coefficients):
 
 
 @njit(cache=True)
-def _view_cost(X, f, length, offset, correction, image_weight, length_weight, edges, n_near, hinges, stencils, weights):
+def _view_cost(X, f, drift, offset, correction, image_weight, length_weight, factor_weight, terms):
     """Half the robust weighted sum of squares of one view.
 
     Args:
         X: (P, 3) points of the view.
         f: (P,) log conformal factors, or (0,) in isometric use.
-        length: (E,) latent log lengths.
+        drift: (P,) log depth minus that of the start.
         offset: (E,) log ratio of arc to chord.
         correction: (P, 2) ray corrections.
         image_weight: (P,) inverse standard deviation of the image points.
         length_weight: (E,) inverse standard deviation of the log length residuals.
-        edges, n_near, hinges: the mesh.
-        stencils: (H, 4) hinge coefficients.
-        weights: see `Weights`.
+        factor_weight: inverse standard deviation of the log conformal factors.
+        terms: what all views share.
     """
+    edges, n_near, hinges, stencils, log_length, weights = terms
     conformal = len(f) > 0
     total = 0.0
     for e in range(len(edges)):
         i, k = edges[e, 0], edges[e, 1]
-        r = log_chord_kernel(X[i, 0], X[i, 1], X[i, 2], X[k, 0], X[k, 1], X[k, 2])[0] + offset[e] - length[e]
+        r = log_chord_kernel(X[i, 0], X[i, 1], X[i, 2], X[k, 0], X[k, 1], X[k, 2])[0] + offset[e] - log_length[e]
         if conformal:
             r -= 0.5 * (f[i] + f[k])
             if e < n_near:
@@ -85,9 +99,10 @@ def _view_cost(X, f, length, offset, correction, image_weight, length_weight, ed
         r = abs(r * length_weight[e])
         total += 0.5 * r * r if r <= weights.huber else weights.huber * (r - 0.5 * weights.huber)
     for i in range(len(X)):
+        total += 0.5 * (weights.drift * drift[i]) ** 2
         total += 0.5 * image_weight[i] ** 2 * (correction[i, 0] ** 2 + correction[i, 1] ** 2)
         if conformal:
-            total += 0.5 * (weights.factor * f[i]) ** 2
+            total += 0.5 * (factor_weight * f[i]) ** 2
     if weights.bending > 0.0:
         for h in range(len(hinges)):
             for a in range(3):
@@ -100,7 +115,7 @@ def _view_cost(X, f, length, offset, correction, image_weight, length_weight, ed
 
 @njit(cache=True)
 def _linearise_view(
-    X, f, length, offset, correction, image_weight, length_weight, edges, n_near, hinges, stencils, weights, envelope,
+    X, f, drift, offset, correction, image_weight, length_weight, factor_weight, terms, envelope,
     matrix, gradient, border, residual, inverse_variance,
 ):  # fmt: skip
     """Normal equations of one view; arguments before `envelope` as in `_view_cost`.
@@ -113,6 +128,7 @@ def _linearise_view(
         residual: output (E,) length residuals.
         inverse_variance: output (E,) their weights, robust loss included.
     """
+    edges, n_near, hinges, stencils, log_length, weights = terms
     conformal = len(f) > 0
     m = 4 if conformal else 3
     row = envelope.start[:-1] - envelope.first
@@ -124,7 +140,7 @@ def _linearise_view(
     for e in range(len(edges)):
         i, k = edges[e, 0], edges[e, 1]
         chord = log_chord_kernel(X[i, 0], X[i, 1], X[i, 2], X[k, 0], X[k, 1], X[k, 2])
-        r = chord[0] + offset[e] - length[e]
+        r = chord[0] + offset[e] - log_length[e]
         for c in range(3):
             at[c], at[m + c] = unknown[i] + c, unknown[k] + c
             J[c], J[m + c] = chord[1 + c], chord[4 + c]
@@ -148,6 +164,9 @@ def _linearise_view(
             border[e, c] = J[c]
         _add_row(matrix, row, gradient, at, J, 2 * m, w, r)
     for i in range(len(X)):
+        n = unknown[i]
+        matrix[row[n] + n] += weights.drift**2
+        gradient[n] += weights.drift**2 * drift[i]
         w = image_weight[i] ** 2
         for c in range(2):
             n = unknown[i] + 1 + c
@@ -155,8 +174,8 @@ def _linearise_view(
             gradient[n] += w * correction[i, c]
         if conformal:
             n = unknown[i] + 3
-            matrix[row[n] + n] += weights.factor**2
-            gradient[n] += weights.factor**2 * f[i]
+            matrix[row[n] + n] += factor_weight**2
+            gradient[n] += factor_weight**2 * f[i]
     if weights.bending > 0.0:
         w = weights.bending**2
         for h in range(len(hinges)):
@@ -183,141 +202,23 @@ def _add_row(matrix, row, gradient, at, J, n, w, r):
                 matrix[row[at[a]] + at[b]] += w * J[a] * J[b]
 
 
-@njit(cache=True, inline="always")
-def _triangle_normals(X, triangles, normal):
-    """Normals (P, 3) of the vertices: those of the triangles around them, weighted by area."""
-    normal[:] = 0.0
-    for t in range(len(triangles)):
-        i, j, k = triangles[t]
-        a, b = X[j] - X[i], X[k] - X[i]
-        cross = (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
-        for c in range(3):
-            normal[i, c] += cross[c]
-            normal[j, c] += cross[c]
-            normal[k, c] += cross[c]
-    for i in range(len(X)):
-        size = np.sqrt(normal[i, 0] ** 2 + normal[i, 1] ** 2 + normal[i, 2] ** 2)
-        if size > 0.0:
-            normal[i] /= size
-        else:
-            normal[i] = X[i] / np.sqrt(X[i, 0] ** 2 + X[i, 1] ** 2 + X[i, 2] ** 2)
-
-
-@njit(cache=True)
-def _arc_offsets(X, triangles, edges, offset):
-    """Log ratio of arc to chord of every edge of one view.
-
-    Slopes come from a quadric about each vertex, fitted to its neighbours' heights over the plane of its triangles'
-    mean normal; the mean normal alone is one-sided at the border.
-    """
-    P = len(X)
-    normal, axis = np.empty((P, 3)), np.empty((P, 2, 3))
-    _triangle_normals(X, triangles, normal)
-    scale, count = np.zeros(P), np.zeros(P)
-    for e in range(len(edges)):
-        i, k = edges[e]
-        square = (X[k, 0] - X[i, 0]) ** 2 + (X[k, 1] - X[i, 1]) ** 2 + (X[k, 2] - X[i, 2]) ** 2
-        for p in (i, k):
-            scale[p] += square
-            count[p] += 1.0
-    for i in range(P):
-        n = normal[i]
-        scale[i] = np.sqrt(scale[i] / max(count[i], 1.0))
-        c = 0 if abs(n[0]) < 0.6 else 1
-        t = -n[c] * n
-        t[c] += 1.0
-        t /= np.sqrt(t[0] ** 2 + t[1] ** 2 + t[2] ** 2)
-        axis[i, 0] = t
-        axis[i, 1, 0] = n[1] * t[2] - n[2] * t[1]
-        axis[i, 1, 1] = n[2] * t[0] - n[0] * t[2]
-        axis[i, 1, 2] = n[0] * t[1] - n[1] * t[0]
-    A, b, row = np.zeros((P, 5, 5)), np.zeros((P, 5)), np.empty(5)
-    for e in range(len(edges)):
-        for end in range(2):
-            p, other = edges[e, end], edges[e, 1 - end]
-            if not scale[p] > 0.0:
-                continue
-            x = y = h = 0.0
-            for c in range(3):
-                d = (X[other, c] - X[p, c]) / scale[p]
-                x += d * axis[p, 0, c]
-                y += d * axis[p, 1, c]
-                h += d * normal[p, c]
-            row[0], row[1], row[2], row[3], row[4] = x, y, x * x, x * y, y * y
-            weight = 1.0 / max(x * x + y * y, 1e-4)
-            for r in range(5):
-                b[p, r] += weight * row[r] * h
-                for c in range(5):
-                    A[p, r, c] += weight * row[r] * row[c]
-    for i in range(P):
-        for r in range(5):
-            A[i, r, r] += QUADRIC_RIDGE
-        slope = np.linalg.solve(A[i], b[i])
-        normal[i] -= slope[0] * axis[i, 0] + slope[1] * axis[i, 1]
-        normal[i] /= np.sqrt(normal[i, 0] ** 2 + normal[i, 1] ** 2 + normal[i, 2] ** 2)
-    for e in range(len(edges)):
-        i, k = edges[e]
-        dx, dy, dz = X[k, 0] - X[i, 0], X[k, 1] - X[i, 1], X[k, 2] - X[i, 2]
-        size = np.sqrt(dx * dx + dy * dy + dz * dz)
-        offset[e] = 0.0
-        if size > 0.0:
-            offset[e] = arc_offset(
-                (normal[i, 0] * dx + normal[i, 1] * dy + normal[i, 2] * dz) / size,
-                (normal[k, 0] * dx + normal[k, 1] * dy + normal[k, 2] * dz) / size,
-            )
-
-
 @njit(cache=True, nogil=True)
-def arc_offset_kernel(first, last, X, triangles, edges, offset):
-    """Log ratio of arc to chord of every edge into `offset` (F, E), for views first to last - 1."""
-    for v in range(first, last):
-        _arc_offsets(X[v], triangles, edges, offset[v])
-
-
-@njit(cache=True, nogil=True)
-def cost_kernel(
-    first,
-    last,
-    X,
-    f,
-    length,
-    offset,
-    correction,
-    image_weight,
-    length_weight,
-    edges,
-    n_near,
-    hinges,
-    stencils,
-    weights,
-    cost,
-):
+def cost_kernel(first, last, X, f, drift, offset, correction, image_weight, length_weight, factor_weight, terms, cost):
     """Cost of views first to last - 1 into `cost` (F,); arguments as in `_view_cost`, with a dimension for views."""
     for v in range(first, last):
         cost[v] = _view_cost(
-            X[v],
-            f[v],
-            length,
-            offset[v],
-            correction[v],
-            image_weight[v],
-            length_weight[v],
-            edges,
-            n_near,
-            hinges,
-            stencils,
-            weights,
+            X[v], f[v], drift[v], offset[v], correction[v], image_weight[v], length_weight[v], factor_weight[v], terms
         )
 
 
 @njit(cache=True, nogil=True)
 def linearise_kernel(
-    first, last, X, f, length, offset, correction, image_weight, length_weight, edges, n_near, hinges, stencils, weights, envelope,
+    first, last, X, f, drift, offset, correction, image_weight, length_weight, factor_weight, terms, envelope,
     matrix, gradient, border, residual, inverse_variance,
 ):  # fmt: skip
     """Normal equations of views first to last - 1; arguments as in `_linearise_view`, with a dimension for views."""
     for v in range(first, last):
         _linearise_view(
-            X[v], f[v], length, offset[v], correction[v], image_weight[v], length_weight[v], edges, n_near, hinges, stencils, weights,
+            X[v], f[v], drift[v], offset[v], correction[v], image_weight[v], length_weight[v], factor_weight[v], terms,
             envelope, matrix[v], gradient[v], border[v], residual[v], inverse_variance[v],
         )  # fmt: skip

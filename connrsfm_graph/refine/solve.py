@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from connrsfm_graph.errors import ComputationError
-from connrsfm_graph.refine.cost import Weights, arc_offset_kernel, cost_kernel, hinge_stencils, linearise_kernel
+from connrsfm_graph.refine.cost import Terms, Weights, cost_kernel, hinge_stencils, linearise_kernel
+from connrsfm_graph.refine.curvature import arc_offset_kernel
 from connrsfm_graph.refine.elimination import Envelope, Factorised, NormalEquations, make_envelope
 from connrsfm_graph.refine.mesh import Mesh
 from connrsfm_graph.refine.threads import over_views
@@ -39,9 +40,26 @@ class Shape:
         depth = np.exp(self.log_depth)[..., None]
         return np.concatenate([depth * (image + self.correction), depth], axis=-1)
 
-    def views(self, index: np.ndarray | slice) -> Shape:
+    def views(self, index: np.ndarray) -> Shape:
         """The shape of some views."""
         return Shape(self.log_depth[index], self.correction[index], self.log_factor[index], self.log_length)
+
+    def replaced(self, index: np.ndarray, other: Shape) -> Shape:
+        """The shape with some views taken from a shape of only these."""
+        parts = [array.copy() for array in (self.log_depth, self.correction, self.log_factor)]
+        for part, new in zip(parts, (other.log_depth, other.correction, other.log_factor), strict=True):
+            part[index] = new
+        return Shape(parts[0], parts[1], parts[2], self.log_length)
+
+    def with_views(self, chosen: np.ndarray, other: Shape) -> Shape:
+        """The shape with the chosen views (F,) bool taken from another one of the same lengths."""
+        keep = chosen[:, None]
+        return Shape(
+            np.where(keep, other.log_depth, self.log_depth),
+            np.where(keep[..., None], other.correction, self.correction),
+            np.where(keep, other.log_factor, self.log_factor),
+            self.log_length,
+        )
 
 
 @dataclass(frozen=True)
@@ -52,8 +70,12 @@ class Measurements:
     """(F, P, 2) image points, normalised coordinates; finite everywhere, interpolated where not seen."""
     image_weight: np.ndarray
     """(F, P) inverse standard deviation of the image points."""
+    log_depth: np.ndarray
+    """(F, P) log depths of the start, about which those of the shape may drift."""
     length_weight: np.ndarray
     """(F, E) inverse standard deviation of the log lengths."""
+    factor_weight: np.ndarray
+    """(F,) inverse standard deviation of the log conformal factors of a view; not used in an isometric model."""
     mesh: Mesh
     """Edges and hinges."""
     weights: Weights
@@ -63,13 +85,15 @@ class Measurements:
         """Storage of the views' matrices."""
         return make_envelope(self.mesh.order(), [self.mesh.edges, self.mesh.hinges], 4 if conformal else 3)
 
-    def views(self, index: np.ndarray | slice) -> Measurements:
+    def views(self, index: np.ndarray) -> Measurements:
         """The measurements of some views."""
         return replace(
             self,
             image=self.image[index],
             image_weight=self.image_weight[index],
+            log_depth=self.log_depth[index],
             length_weight=self.length_weight[index],
+            factor_weight=self.factor_weight[index],
         )
 
 
@@ -84,13 +108,18 @@ class Lagged:
 
 
 def lag(measurements: Measurements, shape: Shape) -> Lagged:
-    """Hinge coefficients and arc offsets at a shape."""
+    """Hinge coefficients and arc offsets at a shape.
+
+    A conformal model compares chords: Moebius maps keep their ratios exactly, not those of arcs.
+    """
     mesh = measurements.mesh
     stencils = np.zeros((len(mesh.hinges), 4))
     if measurements.weights.bending > 0.0:
         hinge_stencils(np.exp(shape.log_length), mesh.hinge_edges, stencils)
     points = shape.points(measurements.image)
-    offset = np.empty((len(points), len(mesh.edges)))
+    offset = np.zeros((len(points), len(mesh.edges)))
+    if shape.log_factor.size:
+        return Lagged(offset, stencils)
     over_views(arc_offset_kernel, len(points), points, mesh.triangles, mesh.edges, offset)
     return Lagged(offset, stencils)
 
@@ -130,16 +159,13 @@ def _arguments(measurements: Measurements, shape: Shape, lagged: Lagged) -> tupl
     return (
         shape.points(measurements.image),
         shape.log_factor,
-        shape.log_length,
+        shape.log_depth - measurements.log_depth,
         lagged.offset,
         shape.correction,
         measurements.image_weight,
         measurements.length_weight,
-        mesh.edges,
-        mesh.n_near,
-        mesh.hinges,
-        lagged.stencils,
-        measurements.weights,
+        measurements.factor_weight,
+        Terms(mesh.edges, mesh.n_near, mesh.hinges, lagged.stencils, shape.log_length, measurements.weights),
     )
 
 
@@ -206,13 +232,7 @@ def fit_views(measurements: Measurements, shape: Shape, iterations: int) -> tupl
         factorised = Factorised(equations, envelope, measurements.mesh.edges, damping)
         trial = moved(shape, envelope, -factorised.solve_views(equations.gradient), 0.0)
         better = costs(measurements, trial, lagged) <= before
-        keep = better[:, None]
-        shape = Shape(
-            np.where(keep, trial.log_depth, shape.log_depth),
-            np.where(keep[..., None], trial.correction, shape.correction),
-            np.where(keep, trial.log_factor, shape.log_factor),
-            shape.log_length,
-        )
+        shape = shape.with_views(better, trial)
         damping = np.clip(np.where(better, damping / 10.0, damping * 10.0), _DAMPING[1], _DAMPING[2])
         lagged = lag(measurements, shape)
     return shape, costs(measurements, shape, lagged)

@@ -26,7 +26,7 @@ class ThinPlate:
     inverse: np.ndarray
     """(N + 3, N + 3) inverse of the interpolation's system."""
     roughness: float
-    """Standard deviation that leave-one-out errors show, in units of the one that the system predicts up to a factor."""
+    """Standard deviation that leave-one-out errors show, over the one that the system predicts up to a factor."""
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """Values (M, D) at points (M, 2)."""

@@ -1,0 +1,53 @@
+"""Settings of the refinement."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from connrsfm_graph.errors import InputError
+
+Model = Literal["auto", "isometric", "conformal"]
+
+
+@dataclass(frozen=True)
+class RefineConfig:
+    """Refinement over latent edge lengths shared by all views."""
+
+    model: Model = "auto"
+    """What the views' surfaces share: `isometric` their edge lengths, `conformal` the lengths' ratios; `auto` takes the
+    conformal model only where isometry misses the data by more than its assumed noise and conformality does not."""
+    isometric_views: tuple[int, ...] = ()
+    """Views known to be isometric to each other (at least two), for the conformal model: their common metric fixes what
+    conformal invariance alone cannot tell."""
+    length_sigma: float = 0.01
+    """Standard deviation of a log edge length in one view: what the surface stretches, and the mesh does not show."""
+    factor_sigma: float = 0.2
+    """Standard deviation of the difference of log conformal factor between neighbours, for the conformal model."""
+    rings: int = 2
+    """Edges join points up to this distance in the triangulation, 1 or 2."""
+    outliers: bool = True
+    """Whether wrong tracks are looked for and replaced by what the other points and views say."""
+    bending: bool = False
+    """Whether surfaces are kept from bending. Shared lengths alone already keep noise from crumpling a surface."""
+    bending_sigma: float = 8.0
+    """Standard deviation of the hinges' curvature vectors relative to their size."""
+    uncertainty: bool = True
+    """Whether the standard deviations of the depths are computed."""
+    iterations: int = 30
+    """Iterations of the joint solver at most, in each of its runs."""
+    tolerance: float = 1e-3
+    """The solver stops where an iteration lowers the cost by less than this part."""
+
+    def __post_init__(self) -> None:
+        if self.model not in get_args(Model):
+            raise InputError(f"refine.model is '{self.model}', expected one of {', '.join(get_args(Model))}")
+        for name in ("length_sigma", "factor_sigma", "bending_sigma"):
+            if not getattr(self, name) > 0.0:
+                raise InputError(f"refine.{name} is {getattr(self, name)}, expected a positive number")
+        if self.rings not in (1, 2):
+            raise InputError(f"refine.rings is {self.rings}, expected 1 or 2")
+        if self.iterations < 1 or self.tolerance < 0.0:
+            raise InputError("refine.iterations must be at least 1 and refine.tolerance at least 0")
+        if len(self.isometric_views) == 1:
+            raise InputError("refine.isometric_views names one view, expected none or at least two")

@@ -1,0 +1,215 @@
+"""Fits of the isometric and of the conformal model, and the choice between them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from connrsfm_graph.refine.ambiguity import Ambiguity, resolve
+from connrsfm_graph.refine.config import RefineConfig
+from connrsfm_graph.refine.cost import Weights
+from connrsfm_graph.refine.mesh import Mesh
+from connrsfm_graph.refine.noise import Noise
+from connrsfm_graph.refine.restarts import inverted, restart
+from connrsfm_graph.refine.solve import Measurements, Shape, costs, lag, linearise, minimise
+from connrsfm_graph.refine.start import start_mesh, start_shape
+from connrsfm_graph.refine.unseen import Completed
+
+_UNIT = 1e3
+"""Inverse standard deviation of the mean log length."""
+_DRIFT = 0.3
+"""Inverse standard deviation of log depths about their start."""
+_FACTOR = 0.1
+"""Inverse standard deviation of log conformal factors."""
+_DECLARED_FACTOR = 1e3
+"""The same for views declared isometric."""
+_ROUNDS = 4
+"""Fits with noise levels that the one before has shown."""
+_RESTARTS = 4
+"""Rounds of restarts in the conformal model, at most."""
+_CAUGHT = 3.0
+"""A view that costs this many times the median view may be caught in a wrong shape."""
+_MISFIT = 1.0
+"""Isometry is in doubt where its squared residuals exceed this many assumed variances on average."""
+_RATIO = 6.0
+"""The conformal model must then lower the cost by this factor: its many unknowns alone already gain a lot."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is to be fitted."""
+
+    completed: Completed
+    """Image points and log depths of all views, interpolated where not seen."""
+    seen: np.ndarray
+    """(F, P) bool."""
+    mesh: Mesh
+    """Neighbours."""
+    config: RefineConfig
+    """Settings."""
+
+    @staticmethod
+    def of(completed: Completed, seen: np.ndarray, config: RefineConfig) -> Task:
+        """With the mesh of the start."""
+        return Task(completed, seen, start_mesh(completed, seen, config.rings), config)
+
+    @property
+    def declared(self) -> np.ndarray:
+        """(F,) bool, views declared isometric to each other."""
+        return np.isin(np.arange(len(self.seen)), self.config.isometric_views)
+
+    def spacing(self) -> float:
+        """Median image length of the near edges."""
+        near = self.mesh.edges[: self.mesh.n_near]
+        image = self.completed.image
+        return float(np.median(np.linalg.norm(image[:, near[:, 0]] - image[:, near[:, 1]], axis=-1)))
+
+    def measurements(self, noise: Noise) -> Measurements:
+        """Measurements under given noise levels."""
+        config = self.config
+        return Measurements(
+            image=self.completed.image,
+            image_weight=noise.image_weight(self.seen, self.completed.deviation),
+            log_depth=start_shape(self.completed, self.mesh).log_depth,
+            length_weight=np.full((len(self.seen), len(self.mesh.edges)), 1.0 / config.length_sigma),
+            factor_weight=np.where(self.declared, _DECLARED_FACTOR, _FACTOR),
+            mesh=self.mesh,
+            weights=Weights(
+                huber=noise.huber,
+                bending=1.0 / config.bending_sigma if config.bending else 0.0,
+                smoothness=1.0 / config.factor_sigma,
+                drift=_DRIFT,
+                unit=_UNIT,
+            ),
+        )
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A shape that fits the measurements, and how it was found."""
+
+    measurements: Measurements
+    shape: Shape
+    noise: Noise
+    history: list[float]
+    """Cost at the start and after every iteration, run after run."""
+    first_cost: float
+    """Cost of the best shape under the noise levels of the start."""
+    evidence: dict[str, Any] = field(default_factory=dict)
+    """What the choices rest on."""
+    ambiguity: Ambiguity | None = None
+    """Which views may be inverted; None in an isometric model."""
+    alternative: Shape | None = None
+    """The shape with all ambiguous views inverted."""
+
+    @property
+    def conformal(self) -> bool:
+        return self.shape.log_factor.size > 0
+
+    def residuals(self) -> np.ndarray:
+        """(F, E) length residuals."""
+        envelope = self.measurements.envelope(self.conformal)
+        return linearise(self.measurements, self.shape, lag(self.measurements, self.shape), envelope)[1]
+
+
+def fit(task: Task, sigma_image: float) -> Fit:
+    """The model that the data ask for, or the one that was asked for.
+
+    Args:
+        task: what is to be fitted.
+        sigma_image: standard deviation of the image points, normalised coordinates; NaN where not known.
+    """
+    noise = Noise.start(sigma_image, task.spacing())
+    wanted = task.config.model
+    if wanted == "conformal":
+        return fit_conformal(task, noise)
+    isometric = fit_isometric(task, noise)
+    F, P = task.seen.shape
+    E = len(task.mesh.edges)
+    misfit = 2.0 * isometric.first_cost / max(F * E - F * P - E, 1)
+    isometric.evidence["isometric misfit"] = misfit
+    if wanted == "isometric" or misfit <= _MISFIT:
+        return isometric
+    conformal = fit_conformal(task, noise)
+    ratio = isometric.first_cost / max(conformal.first_cost, 1e-300)
+    for found in (isometric, conformal):
+        found.evidence["isometric misfit"] = misfit
+        found.evidence["isometric over conformal cost"] = ratio
+    return conformal if ratio > _RATIO else isometric
+
+
+def fit_isometric(task: Task, noise: Noise) -> Fit:
+    """Isometric fit from the start; views that cost far more than the others try other starts."""
+    measurements = task.measurements(noise)
+    shape, history = _minimise(task, measurements, start_shape(task.completed, task.mesh))
+    cost = costs(measurements, shape, lag(measurements, shape))
+    caught = np.flatnonzero(cost > _CAUGHT * np.median(cost))
+    if len(caught):
+        better, renewed = restart(measurements.views(caught), shape.views(caught))
+        if renewed.any():
+            shape, more = _minimise(task, measurements, shape.replaced(caught, better))
+            history += more
+    return _settled(task, Fit(measurements, shape, noise, history, history[-1]))
+
+
+def fit_conformal(task: Task, noise: Noise) -> Fit:
+    """Conformal fit from the start: all views restarted until none gains, then inversions resolved."""
+    measurements = task.measurements(noise)
+    shape, history = _minimise(task, measurements, start_shape(task.completed, task.mesh, conformal=True))
+    for _ in range(_RESTARTS):
+        shape, renewed = restart(measurements, shape)
+        if not renewed.any():
+            break
+        shape, more = _minimise(task, measurements, shape)
+        history += more
+    shape, ambiguity = resolve(shape, measurements.image, task.mesh, task.declared)
+    shape, more = _minimise(task, measurements, shape)
+    history += more
+    alternative = None
+    if ambiguity.group.any():
+        alternative, other = _minimise(task, measurements, inverted(shape, measurements.image, ambiguity.group > 0))
+        # Where one inversion is common to all undecided views, the conformal factors decide which varies less.
+        if ambiguity.group.max() == 1 and other[-1] < history[-1]:
+            shape, alternative = alternative, shape
+            history += other
+    found = _settled(task, Fit(measurements, shape, noise, history, history[-1]))
+    found.evidence["conformal factors rest on"] = ambiguity.assumption
+    found.evidence["views that might be inverted"] = np.flatnonzero(ambiguity.group).tolist()
+    return Fit(
+        found.measurements,
+        found.shape,
+        found.noise,
+        found.history,
+        found.first_cost,
+        found.evidence,
+        ambiguity,
+        alternative,
+    )
+
+
+def _minimise(task: Task, measurements: Measurements, shape: Shape) -> tuple[Shape, list[float]]:
+    return minimise(measurements, shape, task.config.iterations, task.config.tolerance)
+
+
+def _settled(task: Task, found: Fit) -> Fit:
+    """The fit after its noise levels have settled."""
+    for _ in range(_ROUNDS - 1):
+        noise = found.noise.updated(found.shape.correction[task.seen], found.residuals() / task.config.length_sigma)
+        if noise.settled(found.noise):
+            break
+        measurements = task.measurements(noise)
+        shape, history = _minimise(task, measurements, found.shape)
+        found = Fit(measurements, shape, noise, found.history + history, found.first_cost, found.evidence)
+    correction = found.shape.correction[task.seen]
+    found.evidence.update(
+        {
+            "image noise": found.noise.sigma,
+            "image noise over image length of an edge": float(np.sqrt(2.0)) * found.noise.sigma / found.noise.spacing,
+            "root mean square ray correction": float(np.sqrt((correction**2).mean())),
+            "median absolute length residual": float(np.median(np.abs(found.residuals()))),
+            "bending": task.config.bending,
+        }
+    )
+    return found
