@@ -23,24 +23,25 @@ from factors.jacobian_check import Example
 from factors.keys import MAP_POINT, VIEW_SCALE, key
 
 
-def motion_coefficients(views: Sequence[int]) -> np.ndarray:
-    """Coefficients c of the map points of two views (motion) or of three (change of velocity), in order of time.
+def motion_coefficients(views: np.ndarray | Sequence[int]) -> np.ndarray:
+    """Coefficients c (..., K) of the map points of K = 2 views (motion) or 3 (change of velocity), in order of time.
 
     Raises:
         ValueError: not two or three views, or not in ascending order.
     """
     steps = np.diff(views)
-    if len(steps) not in (1, 2) or (steps <= 0).any():
-        raise ValueError(f"map motion: views {tuple(views)}, expected two or three in ascending order")
-    if len(steps) == 1:
-        return np.array([-1.0, 1.0])
-    first, second = 1.0 / steps
-    return np.array([first, -first - second, second])
+    if steps.shape[-1] not in (1, 2) or (steps <= 0).any():
+        raise ValueError(f"map motion: views {views}, expected two or three in ascending order")
+    if steps.shape[-1] == 1:
+        return np.concatenate([-np.ones_like(steps), np.ones_like(steps)], axis=-1).astype(float)
+    first, second = np.moveaxis(1.0 / steps, -1, 0)
+    return np.stack([first, -first - second, second], axis=-1)
 
 
-def motion_variance(views: Sequence[int]) -> float:
-    """Variance of the residual in units of that of neighbouring views: motion and velocity walk at random."""
-    return float(views[-1] - views[0]) / (len(views) - 1)
+def motion_variance(views: np.ndarray | Sequence[int]) -> np.ndarray:
+    """Variance (...) of the residual in units of that of neighbouring views: motion and velocity walk at random."""
+    views = np.asarray(views)
+    return (views[..., -1] - views[..., 0]) / (views.shape[-1] - 1.0)
 
 
 def scale_view(n_views: int) -> int:
@@ -77,7 +78,7 @@ def map_motion_factor(point: int, views: Sequence[int], sigma: float) -> gtsam.C
         sigma: standard deviation of a coordinate for neighbouring views, in the reconstruction's unit of depth; it
             grows with the root of the number of views in between.
     """
-    noise = gtsam.noiseModel.Isotropic.Sigma(3, sigma * motion_variance(views) ** 0.5)
+    noise = gtsam.noiseModel.Isotropic.Sigma(3, sigma * float(motion_variance(views)) ** 0.5)
     keys = [*(key(MAP_POINT, point, view) for view in views), key(VIEW_SCALE, 0, views[scale_view(len(views))])]
     readers = (*(gtsam.Values.atPoint3,) * len(views), gtsam.Values.atVector)
     return make_factor(MapMotion(motion_coefficients(views)), keys, (*(3,) * len(views), 1), noise, readers=readers)

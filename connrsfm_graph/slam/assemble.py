@@ -18,7 +18,7 @@ import numpy as np
 
 from connrsfm_graph.errors import InputError
 from connrsfm_graph.reconstruction import Reconstruction
-from connrsfm_graph.slam.sightings import FusionNoise, Sightings, estimate_noise
+from connrsfm_graph.slam.sightings import FusionNoise, Sightings, View, estimate_noise
 from factors.camera_anchor import camera_anchor_factor
 from factors.keys import CAMERA_POSE, LOG_DEPTH, MAP_POINT, VIEW_SCALE, describe, key
 from factors.map_motion import map_motion_factor
@@ -84,18 +84,17 @@ def add_reconstruction(
     noise = noise or estimate_noise(sightings)
     model = model or MapModel()
     views = np.flatnonzero(sightings.seen.any(axis=1))
-    new_values = gtsam.Values()
-    for view in views:
-        if not values.exists(pose_key(int(view))):
-            raise InputError(f"view {view}: no {describe(pose_key(int(view)))} among the values; insert a Pose3 for it")
-        g = key(VIEW_SCALE, 0, int(view))
+    new_graph, new_values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    for view in views.tolist():
+        if not values.exists(pose_key(view)):
+            raise InputError(f"view {view}: no {describe(pose_key(view))} among the values; insert a Pose3 for it")
+        g = key(VIEW_SCALE, 0, view)
+        log_scale = values.atVector(g) if values.exists(g) else np.zeros(1)
         if not values.exists(g):
-            new_values.insert(g, np.zeros(1))
-    new_graph = gtsam.NonlinearFactorGraph()
-    for view in views:
-        g = key(VIEW_SCALE, 0, int(view))
-        scale = float((values if values.exists(g) else new_values).atVector(g)[0])
-        add_sightings(new_graph, new_values, sightings, int(view), values.atPose3(pose_key(int(view))), scale, noise, model, pose_key(int(view)))
+            new_values.insert(g, log_scale)
+        pose = values.atPose3(pose_key(view))
+        seen = sightings.view(view)
+        add_view(new_graph, new_values, view, seen, pose, pose_key(view), float(log_scale[0]), noise, model)
     for point in range(sightings.n_points):
         seen = np.flatnonzero(sightings.seen[:, point])
         for start in range(len(seen) - model.window + 1):
@@ -109,41 +108,35 @@ def add_reconstruction(
     values.insert(new_values)
 
 
-def add_sightings(
+def add_view(
     graph: gtsam.NonlinearFactorGraph,
     values: gtsam.Values,
-    sightings: Sightings,
-    row: int,
+    number: int,
+    view: View,
     pose: gtsam.Pose3,
+    pose_key: int,
     log_scale: float,
     noise: FusionNoise,
     model: MapModel,
-    pose_key: int,
-    view: int | None = None,
 ) -> None:
     """Anchors and depths of one view, its map points starting where pose, scale and depths put them.
 
     Args:
         graph, values: extended in place.
-        sightings, row: which view of which sightings.
-        pose, log_scale: of the camera, to start from.
+        number, view: the view's index in the keys, and what it saw.
+        pose, pose_key, log_scale: of the camera, to start from.
         noise, model: as in `add_reconstruction`.
-        pose_key: key of the pose.
-        view: index of the view in the keys; `row` where None.
     """
-    view = row if view is None else view
     anchor_noise = model.anchor_noise(noise.image)
-    (points,) = np.nonzero(sightings.seen[row])
-    world = pose.transformFrom(np.exp(log_scale) * sightings.points()[row, points].T).T
-    for point, start in zip(points.tolist(), world, strict=True):
-        b, m = key(LOG_DEPTH, point, view), key(MAP_POINT, point, view)
-        log_depth = sightings.log_depth[row, point : point + 1]
-        own = sightings.depth_std[row, point]
-        sigma = gtsam.noiseModel.Isotropic.Sigma(1, noise.depth if np.isnan(own) else float(own))
-        graph.add(camera_anchor_factor(point, view, sightings.image[row, point], anchor_noise, pose_key=pose_key))
-        graph.add(gtsam.PriorFactorVector(b, log_depth, sigma))
+    world = pose.transformFrom(np.exp(log_scale) * view.camera_points().T).T
+    depth_std = np.where(np.isnan(view.depth_std), noise.depth, view.depth_std)
+    for n, point in enumerate(view.points.tolist()):
+        b, m = key(LOG_DEPTH, point, number), key(MAP_POINT, point, number)
+        log_depth = view.log_depth[n : n + 1]
+        graph.add(camera_anchor_factor(point, number, view.image[n], anchor_noise, pose_key=pose_key))
+        graph.add(gtsam.PriorFactorVector(b, log_depth, gtsam.noiseModel.Isotropic.Sigma(1, depth_std[n])))
         values.insert(b, log_depth)
-        values.insert(m, start)
+        values.insert(m, world[n])
 
 
 def link_scales(a: int, b: int, noise: FusionNoise) -> gtsam.NonlinearFactor:

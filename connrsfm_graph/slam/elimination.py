@@ -71,25 +71,41 @@ class Reduced:
 class MapTerms:
     """The map's part of the cost of `assemble.add_reconstruction`."""
 
-    def __init__(self, sightings: Sightings, noise: FusionNoise, model: MapModel):
+    def __init__(
+        self,
+        sightings: Sightings,
+        noise: FusionNoise,
+        model: MapModel,
+        times: np.ndarray | None = None,
+        held: np.ndarray | None = None,
+    ):
+        """Gather the sightings.
+
+        Args:
+            sightings, noise, model: as in `assemble.add_reconstruction`.
+            times: (F,) number of each view where they do not follow each other.
+            held: (F,) bool, views whose map points keep their places: only their motion to other views counts.
+        """
         self.n_views = sightings.n_views
         self.point, self.view = np.nonzero(sightings.seen.T)
         N = len(self.point)
+        times = np.arange(self.n_views) if times is None else np.asarray(times)
+        self.free = np.ones(N, dtype=bool) if held is None else ~held[self.view]
         self.image = sightings.image[self.view, self.point]
         self.log_depth = sightings.log_depth[self.view, self.point]
         own = sightings.depth_std[self.view, self.point]
-        self.depth_weight = np.where(np.isnan(own), noise.depth, own) ** -2.0
-        self.image_weight = noise.image**-2.0
+        self.depth_weight = self.free * np.where(np.isnan(own), noise.depth, own) ** -2.0
+        self.image_weight = self.free * noise.image**-2.0
         self.huber = model.huber
         self.starts = np.append(np.flatnonzero(np.diff(self.point, prepend=-1)), N)
         # Windows of a motion factor: consecutive sightings of one point.
         size = model.window
         first = np.arange(N - size + 1) if size <= N else np.empty(0, dtype=int)
-        first = first[self.point[first] == self.point[first + size - 1]]
+        first = first[(self.point[first] == self.point[first + size - 1]) & self.free[first + size - 1]]
         self.window = first[:, None] + np.arange(size)
         views = self.view[self.window]
-        self.coefficients = np.array([motion_coefficients(row) for row in views]).reshape(-1, size)
-        self.motion_weight = np.array([1.0 / motion_variance(row) for row in views]) / noise.motion**2
+        self.coefficients = motion_coefficients(times[views])
+        self.motion_weight = 1.0 / (motion_variance(times[views]) * noise.motion**2)
         self.unit_row = scale_view(size)
         # The coupling's columns of the scales of neighbouring sightings, where a motion factor joins them.
         self.columns = np.full((N, _COUPLED), -1)
@@ -128,10 +144,12 @@ class MapTerms:
         r, J = self._anchors(state)
         norm = np.sqrt(self.image_weight * (r**2).sum(axis=1))
         w = self.image_weight * np.minimum(1.0, self.huber / np.maximum(norm, 1e-300))
+        # Held sightings have no weight; ones on their diagonals keep the systems regular.
+        fixed = ~self.free
         # Log depths: one row and one column each.
         q = J[:, :, DEPTH.start]
         others = np.concatenate([J[:, :, : DEPTH.start], J[:, :, POINT]], axis=2)
-        diagonal = w * (q**2).sum(axis=1) + self.depth_weight + damping
+        diagonal = w * (q**2).sum(axis=1) + self.depth_weight + damping + fixed
         rows = w[:, None] * np.einsum("ni,nij->nj", q, others)
         gradient = w * (q * r).sum(axis=1) + self.depth_weight * (state.b - self.log_depth)
         normal = w[:, None, None] * np.einsum("nki,nkj->nij", others, others)
@@ -161,8 +179,10 @@ class MapTerms:
             np.add.at(coupling[:, :, self._slot(k)], self.window[:, k], -pull)
             for l in range(k, size):
                 product = self.motion_weight * unit**2 * self.coefficients[:, k] * self.coefficients[:, l]
-                np.add.at(off[l - k], self.window[:, k], product)
-        blocks += off[0][:, None, None] * np.eye(3)
+                both = (self.free[self.window[:, k]] & self.free[self.window[:, l]]) | (k == l)
+                np.add.at(off[l - k], self.window[:, k], product * both)
+        blocks += (off[0] + fixed)[:, None, None] * np.eye(3)
+        coupling[fixed], point_gradient[fixed] = 0.0, 0.0
 
         hessian = np.zeros((CAMERA * self.n_views, CAMERA * self.n_views))
         reduced = np.zeros(CAMERA * self.n_views + 1)

@@ -10,7 +10,7 @@ length the scale of the first view. See `assemble` for what decides between moti
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, field
 
 import gtsam
@@ -103,42 +103,76 @@ def fuse(
     # What is known without the map first: a landmark that cameras turn away from must not pull at the surface.
     start, _, _ = levenberg_marquardt(rest, start, config.levenberg)
     terms = MapTerms(sightings, noise, config.map)
-    state = terms.start(*_cameras(start, sightings.n_views))
-    columns = _Columns(rest, start, cameras)
-    cost = terms.cost(state) + rest.error(start)
+    state = terms.start(*camera_arrays(start, range(sightings.n_views)))
+    columns = Columns(rest, start, cameras)
+    state, start, history = minimise(terms, state, rest, start, columns, config.levenberg, progress)
+    return _fused(terms, sightings, state, start, rest, columns, cameras, history)
+
+
+def minimise(
+    terms: MapTerms,
+    state: MapState,
+    rest: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
+    columns: Columns,
+    settings: Levenberg,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[MapState, gtsam.Values, list[float]]:
+    """Levenberg-Marquardt over the map and the free variables of the rest of the graph.
+
+    Returns:
+        Map, values and the costs at the start and after every accepted step.
+
+    Raises:
+        InputError: the cost at the start is not a number.
+    """
+    cost = terms.cost(state) + rest.error(values)
     if not np.isfinite(cost):
         raise InputError("fusion: the cost at the start is not a number; check poses and measurements")
-    history, damping = [cost], config.levenberg.damping
-    while len(history) <= config.levenberg.max_iterations:
-        hessian, gradient = columns.normal_equations(rest.linearize(start))
+    history, damping = [cost], settings.damping
+    while len(history) <= settings.max_iterations:
+        hessian, gradient = columns.normal_equations(rest.linearize(values))
         while True:
             try:
-                step, trial = _step(terms, state, start, columns, hessian, gradient, damping)
-                new = terms.cost(step) + rest.error(trial)
-            except (LinAlgError, RuntimeError, ValueError):
+                next_state, next_values = _step(terms, state, values, columns, hessian, gradient, damping)
+                new = terms.cost(next_state) + rest.error(next_values)
+            except (LinAlgError, RuntimeError, ValueError):  # indeterminate, or a residual that is not a number
                 new = np.inf
             if new <= cost:
                 break
             damping *= 10.0
             if damping > MAX_DAMPING:
-                break
-        if damping > MAX_DAMPING:
-            break
-        decrease, cost, state, start = cost - new, new, step, trial
+                return state, values, history
+        decrease, cost, state, values = cost - new, new, next_state, next_values
         history.append(cost)
         damping = max(damping / 10.0, MIN_DAMPING)
         if progress is not None:
-            progress(len(history) - 1, config.levenberg.max_iterations)
-        if decrease <= config.levenberg.tolerance * cost:
+            progress(len(history) - 1, settings.max_iterations)
+        if decrease <= settings.tolerance * cost:
             break
-    return _fused(terms, sightings, state, start, rest, columns, cameras, history)
+    return state, values, history
 
 
-class _Columns:
+class Columns:
     """Where each variable of the rest of the graph stands: cameras first, seven columns each, then all others."""
 
-    def __init__(self, rest: gtsam.NonlinearFactorGraph, values: gtsam.Values, cameras: list[int]):
+    def __init__(
+        self,
+        rest: gtsam.NonlinearFactorGraph,
+        values: gtsam.Values,
+        cameras: list[int],
+        held: Collection[int] = (),
+    ):
+        """Lay out the columns.
+
+        Args:
+            rest: the factors.
+            values: all their variables, and the cameras.
+            cameras: keys of pose and scale of every view of the map, in order.
+            held: keys of the variables that do not move.
+        """
         zero = values.zeroVectors()
+        self.cameras = cameras
         self.n_cameras = CAMERA * (len(cameras) // 2)
         known = set(cameras)
         others = [k for k in values.keys() if k not in known]
@@ -153,6 +187,8 @@ class _Columns:
             ordering.push_back(k)
             place.append(np.arange(self.start[k], self.start[k] + self.size[k]))
         self.ordering, self.place = ordering, np.concatenate(place)
+        free = [np.arange(first, first + self.size[k]) for k, first in self.start.items() if k not in held]
+        self.free = np.sort(np.concatenate(free))
 
     def normal_equations(self, linear: gtsam.GaussianFactorGraph) -> tuple[np.ndarray, np.ndarray]:
         """Hessian and gradient of the rest of the graph over all columns."""
@@ -174,29 +210,31 @@ def _step(
     terms: MapTerms,
     state: MapState,
     values: gtsam.Values,
-    columns: _Columns,
+    columns: Columns,
     hessian: np.ndarray,
     gradient: np.ndarray,
     damping: float,
 ) -> tuple[MapState, gtsam.Values]:
     """State and values after one damped Gauss-Newton step."""
     reduced, normal, right = _joined(terms, state, columns, hessian, gradient, damping)
-    step = cho_solve(cho_factor(normal, lower=True, overwrite_a=True), -right)
+    step = np.zeros(columns.total)
+    step[columns.free] = cho_solve(cho_factor(normal, lower=True, overwrite_a=True), -right)
     depths, points = reduced.back_substitute(step[: columns.n_cameras])
     trial = values.retract(columns.vectors(step))
-    return MapState(*_cameras(trial, terms.n_views), state.b + depths, state.m + points), trial
+    views = [decode(k)[2] for k in columns.cameras[::2]]
+    return MapState(*camera_arrays(trial, views), state.b + depths, state.m + points), trial
 
 
 def _joined(
-    terms: MapTerms, state: MapState, columns: _Columns, hessian: np.ndarray, gradient: np.ndarray, damping: float
+    terms: MapTerms, state: MapState, columns: Columns, hessian: np.ndarray, gradient: np.ndarray, damping: float
 ) -> tuple[Reduced, np.ndarray, np.ndarray]:
-    """The normal equations of cameras and other variables, the map eliminated."""
+    """The normal equations of the free cameras and other variables, the map eliminated."""
     reduced = terms.reduce(state, damping)
     n = columns.n_cameras
     normal, right = hessian + damping * np.eye(columns.total), gradient.copy()
     normal[:n, :n] += reduced.hessian
     right[:n] += reduced.gradient
-    return reduced, normal, right
+    return reduced, normal[np.ix_(columns.free, columns.free)], right[columns.free]
 
 
 def _with_gauge(
@@ -248,12 +286,13 @@ def _start_values(rest: gtsam.NonlinearFactorGraph, values: gtsam.Values, camera
     return start
 
 
-def _cameras(values: gtsam.Values, n_views: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    poses = [values.atPose3(pose_key(view)) for view in range(n_views)]
+def camera_arrays(values: gtsam.Values, views: Iterable[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rotations (F, 3, 3), centres (F, 3) and log scales (F,) of some views."""
+    cameras = [(values.atPose3(pose_key(view)), values.atVector(key(VIEW_SCALE, 0, view))[0]) for view in views]
     return (
-        np.array([pose.rotation().matrix() for pose in poses]),
-        np.array([pose.translation() for pose in poses]),
-        np.array([values.atVector(key(VIEW_SCALE, 0, view))[0] for view in range(n_views)]),
+        np.array([pose.rotation().matrix() for pose, _ in cameras]),
+        np.array([pose.translation() for pose, _ in cameras]),
+        np.array([g for _, g in cameras]),
     )
 
 
@@ -263,7 +302,7 @@ def _fused(
     state: MapState,
     values: gtsam.Values,
     rest: gtsam.NonlinearFactorGraph,
-    columns: _Columns,
+    columns: Columns,
     cameras: list[int],
     history: list[float],
 ) -> Fused:

@@ -43,6 +43,49 @@ class FusionNoise:
 
 
 @dataclass(frozen=True)
+class View:
+    """The N points that one view saw."""
+
+    points: np.ndarray
+    """(N,) int, their numbers, each once."""
+    image: np.ndarray
+    """(N, 2) normalised image coordinates."""
+    log_depth: np.ndarray
+    """(N,) log depth in the reconstruction's unit."""
+    depth_std: np.ndarray
+    """(N,) standard deviation of log depth, NaN where not known."""
+
+    @staticmethod
+    def checked(
+        points: np.ndarray, image: np.ndarray, log_depth: np.ndarray, depth_std: np.ndarray | None = None
+    ) -> View:
+        """Validate arrays of the shapes above.
+
+        Raises:
+            InputError: shapes do not fit, a point is seen twice, or one is not finite.
+        """
+        points = np.asarray(points, dtype=int)
+        image, log_depth = np.asarray(image, dtype=float), np.asarray(log_depth, dtype=float)
+        N = len(points)
+        depth_std = np.full(N, np.nan) if depth_std is None else np.asarray(depth_std, dtype=float)
+        if image.shape != (N, 2) or log_depth.shape != (N,) or depth_std.shape != (N,):
+            raise InputError(
+                f"{N} points with image {image.shape}, log_depth {log_depth.shape} and depth_std {depth_std.shape}, "
+                f"expected ({N}, 2) and twice ({N},)"
+            )
+        if len(np.unique(points)) != N:
+            raise InputError("a point is seen twice, expected each once")
+        bad = ~(np.isfinite(image).all(axis=1) & np.isfinite(log_depth))
+        if bad.any():
+            raise InputError(f"point {points[bad][0]} is not a finite image point and depth")
+        return View(points, image, log_depth, depth_std)
+
+    def camera_points(self) -> np.ndarray:
+        """(N, 3) in the camera frame, in the reconstruction's unit."""
+        return np.exp(self.log_depth)[:, None] * np.column_stack([self.image, np.ones(len(self.image))])
+
+
+@dataclass(frozen=True)
 class Sightings:
     """Points in views, in normalised image coordinates. Entries that are not `seen` are 0."""
 
@@ -108,10 +151,10 @@ class Sightings:
         """(F, P, 3) points in the camera frames, in the reconstruction's unit; meaningless where not seen."""
         return np.exp(self.log_depth)[..., None] * np.concatenate([self.image, np.ones((*self.seen.shape, 1))], axis=-1)
 
-    def view(self, view: int) -> Sightings:
-        """One view alone, F = 1."""
-        part = slice(view, view + 1)
-        return Sightings(self.image[part], self.seen[part], self.log_depth[part], self.depth_std[part])
+    def view(self, view: int) -> View:
+        """What one view saw."""
+        (points,) = np.nonzero(self.seen[view])
+        return View(points, self.image[view, points], self.log_depth[view, points], self.depth_std[view, points])
 
 
 def estimate_noise(sightings: Sightings, image_sigma: float | None = None) -> FusionNoise:
