@@ -58,3 +58,13 @@ def test_a_named_experiment_writes_into_the_folder(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     assert main(["theorem", "--out", str(tmp_path / "results")]) == 0
     assert (tmp_path / "results" / "theorem.csv").exists()
+
+
+@pytest.mark.slow
+def test_the_quick_set_runs_without_any_data(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    pytest.importorskip("clarabel", reason="the extra 'baselines' is not installed")
+    assert main(["quick", "--data", str(tmp_path / "nothing"), "--out", str(tmp_path)]) == 0
+    written = {path.stem for path in (tmp_path / "quick").glob("*.md")}
+    assert written == set(EXPERIMENTS) - {"tshirt", "flag", "kinect_paper"}
+    assert "| Synthetic 1 | **" in (tmp_path / "quick" / "summary.md").read_text()
