@@ -40,8 +40,9 @@ class GraphConfig:
     """Edges beside the spanning tree, as a multiple of the number of images."""
     extra_edges: int | None = None
     """Edges beside the spanning tree, absolute; overrides `extra_per_frame`."""
-    max_edges: int = 20_000
-    """No extra edges beyond this total (the spanning tree is always kept)."""
+    max_extra: int = 120
+    """No more than this by `extra_per_frame`: eliminating a point's images costs the more the more cycles there are,
+    and on a tree with a bounded number of extra edges it stays linear in the number of images."""
     min_shared: int = 6
     """Fewest shared tracks of a pair: an affinity has six parameters, three points leave nothing to check a warp by."""
     weight: Literal["shared", "parallax"] = "shared"
@@ -105,8 +106,9 @@ def select_edges(visible: np.ndarray, config: GraphConfig | None = None, image: 
         raise ValueError("the weight 'parallax' needs the image coordinates")
 
     tree = _maximum_spanning_tree(n_frames, pairs, weight)
-    wanted = round(config.extra_per_frame * n_frames) if config.extra_edges is None else config.extra_edges
-    wanted = min(wanted, config.max_edges - len(tree))
+    wanted = config.extra_edges
+    if wanted is None:
+        wanted = min(round(config.extra_per_frame * n_frames), config.max_extra)
     chosen = np.concatenate([tree, greedy_edges(n_frames, pairs, weight, tree, wanted)])
     return ImageGraph(n_frames, pairs[chosen], weight[chosen], len(tree))
 

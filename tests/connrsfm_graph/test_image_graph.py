@@ -97,7 +97,8 @@ def test_edges_are_unique_ordered_and_counted() -> None:
     assert (graph.edges[:, 0] < graph.edges[:, 1]).all()
     assert len(np.unique(graph.edges, axis=0)) == len(graph.edges)
     assert (graph.weight == 20).all()
-    assert len(select_edges(visible, GraphConfig(max_edges=10)).edges) == 10
+    tree = visible.shape[0] - 1
+    assert len(select_edges(visible, GraphConfig(max_extra=3)).edges) == tree + 3
     assert len(select_edges(visible, GraphConfig(extra_edges=1000)).edges) == 36
     again = select_edges(visible, GraphConfig(extra_per_frame=2.0))
     np.testing.assert_array_equal(graph.edges, again.edges)
