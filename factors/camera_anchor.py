@@ -122,6 +122,7 @@ def examples(rng: np.random.Generator) -> Iterator[Example]:
         factor = camera_anchor_factor(4, 2, image, noise, checked=True)
         values = gtsam.Values()
         point = pose.transformFrom(np.exp(g[0] + b[0]) * np.array([*image, 1.0]))
-        for k, value in zip(factor.keys(), (pose, g, b, point + distance * rng.normal(size=3)), strict=True):
+        values.insert(factor.keys()[0], pose)
+        for k, value in zip(factor.keys()[1:], (g, b, point + distance * rng.normal(size=3)), strict=True):
             values.insert(k, value)
         yield label, factor, values

@@ -93,8 +93,9 @@ def add_reconstruction(
         if not values.exists(g):
             new_values.insert(g, log_scale)
         pose = values.atPose3(pose_key(view))
-        seen = sightings.view(view)
-        add_view(new_graph, new_values, view, seen, pose, pose_key(view), float(log_scale[0]), noise, model)
+        add_view(
+            new_graph, new_values, view, sightings.view(view), pose, pose_key(view), float(log_scale[0]), noise, model
+        )
     for point in range(sightings.n_points):
         seen = np.flatnonzero(sightings.seen[:, point])
         for start in range(len(seen) - model.window + 1):

@@ -1,4 +1,4 @@
-"""What is known about the cameras, as native GTSAM factors: odometry, known poses, rigid landmarks; and where to start."""
+"""What is known about the cameras, as native GTSAM factors (odometry, known poses, rigid landmarks), and a start."""
 
 from __future__ import annotations
 

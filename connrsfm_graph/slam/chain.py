@@ -107,39 +107,39 @@ def subtract_coupling(starts, inverse, W, coupling, columns, hessian):
         hessian: changed in place.
     """
     C = columns.shape[1]
-    X = np.zeros((3, 3, 3, 3))  # X[i, d]: block (l + i, l + i + d) of A^-1, for the sighting l at hand
-    Z = np.zeros((3, 3, C))  # Z[i]: row k + i of A^-1 E_l, for the sighting k at hand
+    X = np.zeros((3, 3, 3, 3))  # X[i, d]: block (j + i, j + i + d) of A^-1, for the sighting j at hand
+    Z = np.zeros((3, 3, C))  # Z[i]: row k + i of A^-1 E_j, for the sighting k at hand
     for p in range(len(starts) - 1):
         first, last = starts[p], starts[p + 1]
-        for l in range(last - 1, first - 1, -1):
+        for j in range(last - 1, first - 1, -1):
             X[2], X[1] = X[1], X[0]
-            _inverse_blocks(last - l, inverse[l], W[:, l], X)
-            for k in range(l, first - 1, -1):
+            _inverse_blocks(last - j, inverse[j], W[:, j], X)
+            for k in range(j, first - 1, -1):
                 Z[2], Z[1] = Z[1], Z[0]
                 Z[0] = 0.0
-                if k == l:
+                if k == j:
                     Z[1] = 0.0
-                    if l + 1 < last:
-                        _add(Z[1], X[0, 1], coupling[l], True, 1.0)
-                    _add(Z[0], X[0, 0], coupling[l], False, 1.0)
+                    if j + 1 < last:
+                        _add(Z[1], X[0, 1], coupling[j], True, 1.0)
+                    _add(Z[0], X[0, 0], coupling[j], False, 1.0)
                 else:
                     _add(Z[0], W[0, k], Z[1], False, 1.0)
                     _add(Z[0], W[1, k], Z[2], False, 1.0)
-                share = 0.5 if k == l else 1.0
+                share = 0.5 if k == j else 1.0
                 for a in range(C):
                     row = columns[k, a]
                     if row < 0:
                         continue
                     e0, e1, e2 = share * coupling[k, 0, a], share * coupling[k, 1, a], share * coupling[k, 2, a]
                     for c in range(C):
-                        column = columns[l, c]
+                        column = columns[j, c]
                         if column >= 0:
                             hessian[row, column] -= e0 * Z[0, 0, c] + e1 * Z[0, 1, c] + e2 * Z[0, 2, c]
 
 
 @njit(cache=True)
 def _inverse_blocks(length, inverse, W, X):
-    """Blocks (l, l), (l, l + 1) and (l, l + 2) of A^-1 into X[0], from those of l + 1 and l + 2 (Takahashi)."""
+    """Blocks (j, j), (j, j + 1) and (j, j + 2) of A^-1 into X[0], from those of j + 1 and j + 2 (Takahashi)."""
     X[0] = 0.0
     if length > 1:
         _add(X[0, 1], W[0], X[1, 0], False, 1.0)

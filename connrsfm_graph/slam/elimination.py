@@ -1,8 +1,9 @@
 """Anchors, depths and motions of a whole map at once: linearised in batch and eliminated onto the cameras.
 
 The same cost as the factors of `assemble`, point by point. The log depth of a sighting is in one anchor and one prior
-and is eliminated first; what is left of the point is a chain of map points (`chain`), whose couplings E to the cameras reach
-only the camera of each sighting and the scales of its neighbours. The cameras' normal equations get -E^T A^-1 E. Seven columns per camera, pose and log scale; dense, since every point couples all views that see it.
+and is eliminated first; what is left of the point is a chain of map points (`chain`), whose couplings E to the cameras
+reach only the camera of each sighting and the scales of its neighbours. The cameras' normal equations get
+-E^T A^-1 E: seven columns per camera, pose and log scale, dense, since every point couples all views that see it.
 """
 
 from __future__ import annotations
@@ -177,10 +178,10 @@ class MapTerms:
             pull = (self.motion_weight * unit * self.coefficients[:, k])[:, None] * motion
             np.add.at(point_gradient, self.window[:, k], pull)
             np.add.at(coupling[:, :, self._slot(k)], self.window[:, k], -pull)
-            for l in range(k, size):
-                product = self.motion_weight * unit**2 * self.coefficients[:, k] * self.coefficients[:, l]
-                both = (self.free[self.window[:, k]] & self.free[self.window[:, l]]) | (k == l)
-                np.add.at(off[l - k], self.window[:, k], product * both)
+            for later in range(k, size):
+                product = self.motion_weight * unit**2 * self.coefficients[:, k] * self.coefficients[:, later]
+                both = (self.free[self.window[:, k]] & self.free[self.window[:, later]]) | (k == later)
+                np.add.at(off[later - k], self.window[:, k], product * both)
         blocks += (off[0] + fixed)[:, None, None] * np.eye(3)
         coupling[fixed], point_gradient[fixed] = 0.0, 0.0
 
@@ -198,7 +199,9 @@ class MapTerms:
             block = slice(CAMERA * view, CAMERA * (view + 1))
             hessian[block, block] += H[view]
         depth_rows = (rows, gradient, diagonal)
-        return Reduced(hessian, reduced[:-1], (self.starts, inverse, W), coupling, self.columns, point_gradient, depth_rows)
+        return Reduced(
+            hessian, reduced[:-1], (self.starts, inverse, W), coupling, self.columns, point_gradient, depth_rows
+        )
 
     def _anchors(self, state: MapState) -> tuple[np.ndarray, np.ndarray]:
         view = self.view

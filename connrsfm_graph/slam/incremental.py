@@ -70,7 +70,7 @@ class IncrementalFusion:
         self.views: list[View] = []
         """What every view saw."""
         self.graph = gtsam.NonlinearFactorGraph()
-        """All factors but those of the map."""
+        """All factors but those of the map and the links between scales."""
         self.values = gtsam.Values()
         """Current estimate of all variables but those of the map."""
         self._first = gtsam.Pose3() if first is None else gtsam.Pose3(first)
@@ -128,6 +128,7 @@ class IncrementalFusion:
             state, estimate = window.minimised()
         except InputError as error:
             raise InputError(f"view {number}: {error}; the view was not added") from error
+        # Nothing can fail from here on.
         trial.update(estimate)
         self.values = trial
         for n in range(graph.size()):
@@ -161,9 +162,7 @@ class IncrementalFusion:
 
     def finish(self, config: FusionConfig | None = None) -> Fused:
         """The batch fusion of everything so far, from the current estimate."""
-        return fuse(
-            self.sightings(), self.noise, self.graph, self.values, config or FusionConfig(map=self.config.map)
-        )
+        return fuse(self.sightings(), self.noise, self.graph, self.values, config or FusionConfig(map=self.config.map))
 
     def _predicted(self, view: View, step: np.ndarray | None) -> tuple[gtsam.Pose3, float]:
         """Pose and log scale to start a view from: by odometry, or by the map as it was last seen."""
@@ -183,15 +182,13 @@ class IncrementalFusion:
     def _factors(
         self, number: int, pose: gtsam.Pose3, scale: float, step: np.ndarray | None, sigmas: np.ndarray | None
     ) -> gtsam.NonlinearFactorGraph:
-        """Gauge of the first view; scale link and odometry of every other."""
+        """Gauge of the first view, odometry of every other."""
         graph = gtsam.NonlinearFactorGraph()
         if number == 0:
             held = gtsam.noiseModel.Isotropic.Sigma(6, GAUGE_SIGMA)
             unit = gtsam.noiseModel.Isotropic.Sigma(1, self.config.scale_sigma)
             graph.add(gtsam.PriorFactorPose3(pose_key(0), pose, held))
             graph.add(gtsam.PriorFactorVector(key(VIEW_SCALE, 0, 0), np.array([scale]), unit))
-        else:
-            graph.add(link_scales(number - 1, number, self.noise))
         if step is not None:
             sigmas = np.zeros(0) if sigmas is None else np.asarray(sigmas, dtype=float)
             if number == 0 or sigmas.shape != (6,) or not (sigmas > 0).all():
@@ -205,7 +202,12 @@ class _Window:
     """The newest views as a problem of their own, with the places before them that their points are tied to."""
 
     def __init__(
-        self, fusion: IncrementalFusion, number: int, newest: View, values: gtsam.Values, new: gtsam.NonlinearFactorGraph
+        self,
+        fusion: IncrementalFusion,
+        number: int,
+        newest: View,
+        values: gtsam.Values,
+        new: gtsam.NonlinearFactorGraph,
     ):
         self.fusion = fusion
         config = fusion.config
@@ -270,6 +272,8 @@ class _Window:
 
         direct = found(cameras)
         graph = gtsam.NonlinearFactorGraph()
+        for n in range(max(1, number - fusion.config.lag + 1), number + 1):
+            graph.add(link_scales(n - 1, n, fusion.noise))
         factors = [fusion.graph.at(n) for n in direct] + [new.at(n) for n in range(new.size())]
         others = {k for factor in factors for k in factor.keys() if not _is_camera(k)}
         indirect = [fusion.graph.at(n) for n in sorted(found(others) - direct)]

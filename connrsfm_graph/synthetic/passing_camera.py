@@ -67,7 +67,11 @@ def passing_camera(
     points = np.stack([_waving(sheet, swing, moment * n_frames / 40.0) for moment in time])
     poses = _path(time, np.radians(bow_deg))
     background = np.column_stack(
-        [rng.uniform(-4.0, 4.0, n_background), rng.uniform(-2.5, 2.5, n_background), rng.uniform(1.0, 3.0, n_background)]
+        [
+            rng.uniform(-4.0, 4.0, n_background),
+            rng.uniform(-2.5, 2.5, n_background),
+            rng.uniform(1.0, 3.0, n_background),
+        ]
     )
     image, visible = _seen(poses, points)
     background_image, background_visible = _seen(poses, np.broadcast_to(background, (n_frames, n_background, 3)))
