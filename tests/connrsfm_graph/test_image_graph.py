@@ -177,7 +177,7 @@ def test_long_sequences_stay_quick(full: bool) -> None:
     window = np.abs(np.arange(n)[:, None] / n - np.linspace(0, 1, p)) < 0.15
     visible = np.ones((n, p), dtype=bool) if full else window
     start = time.perf_counter()
-    graph = select_edges(visible, GraphConfig(extra_per_frame=0.5))
+    graph = select_edges(visible, GraphConfig(extra_edges=n // 2))
     assert time.perf_counter() - start < 30.0
     assert len(graph.edges) == n - 1 + n // 2
     assert nx.is_connected(nx.Graph(graph.edges.tolist()))
