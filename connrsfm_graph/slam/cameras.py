@@ -157,9 +157,9 @@ def common_scale(sightings: Sightings, poses: np.ndarray, noise: FusionNoise, dr
         moved = (target - source).ravel()
         baseline = np.tile(poses[a + lag, :3, 3] - poses[a, :3, 3], len(target))
         normal = turn.T @ turn + information * np.eye(3)
-        baseline = baseline - turn @ np.linalg.solve(normal, turn.T @ baseline)
-        across -= float(baseline @ moved)
-        along += float(baseline @ baseline)
+        unturned = baseline - turn @ np.linalg.solve(normal, turn.T @ baseline)
+        across -= float(unturned @ moved)
+        along += float(unturned @ baseline)
     return float(np.log(along / across)) if across > 1e-6 * along > 0.0 else 0.0
 
 
