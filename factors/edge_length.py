@@ -88,7 +88,10 @@ class EdgeLength:
 
     def jacobians(self, *x: np.ndarray) -> tuple[np.ndarray, Sequence[np.ndarray]]:
         gradient = np.empty((1, 6))
-        r = _residual(self.image_i, self.image_k, self.offset, *x[:5], gradient[0])
+        z_i, correction_i, z_k, correction_k, length = x[:5]
+        r = _residual(
+            self.image_i, self.image_k, self.offset, z_i, correction_i, z_k, correction_k, length, gradient[0]
+        )
         blocks = [gradient[:, :1], gradient[:, 1:3], gradient[:, 3:4], gradient[:, 4:], np.array([[-1.0]])]
         if len(x) == 7:
             r -= 0.5 * (x[5][0] + x[6][0])
@@ -135,7 +138,8 @@ def examples(rng: np.random.Generator) -> Iterator[Example]:
     """Isometric and conformal factors at random points, for the Jacobian check."""
     for conformal in (False, True):
         noise = gtsam.noiseModel.Isotropic.Sigma(1, 0.3)
-        factor = edge_length_factor(2, 0, 1, 3, *rng.normal(0, 0.4, (2, 2)), noise, 0.01, conformal)
+        image_i, image_k = rng.normal(0, 0.4, (2, 2))
+        factor = edge_length_factor(2, 0, 1, 3, image_i, image_k, noise, 0.01, conformal)
         values = gtsam.Values()
         for k, dim in zip(factor.keys(), (1, 2, 1, 2, 1, 1, 1), strict=False):
             values.insert(k, rng.normal(0.0, 0.2, dim))

@@ -44,7 +44,7 @@ class RenderConfig:
     focal: float = 620.0
     """Focal length in pixels."""
     bend: float = 1.0
-    """Strength of the bending; at 1 the sheet's ends turn by up to about 80 degrees to each other, at 0 it is a moving plane."""
+    """Strength of the bending: at 1 the sheet's ends turn by up to about 80 degrees to each other, at 0 it is flat."""
     noise: float = 1.0
     """Standard deviation of the image noise in grey levels."""
     seed: int = 0

@@ -38,7 +38,9 @@ def test_connections_are_the_logarithmic_derivative_of_the_frame(camera, values)
     for k, step in enumerate(np.eye(2) * h):
         change = (_frame_near(image, y, step, camera) - _frame_near(image, y, -step, camera)) / (2 * h)
         expected = np.linalg.solve(_frame_near(image, y, np.zeros(2), camera), change)
-        assert connections(image, y[:2], y[2:], camera)[k] == pytest.approx(expected, abs=1e-6 * (1 + abs(expected).max()))
+        assert connections(image, y[:2], y[2:], camera)[k] == pytest.approx(
+            expected, abs=1e-6 * (1 + abs(expected).max())
+        )
 
 
 def test_frame_is_the_derivative_of_the_surface():
