@@ -8,13 +8,11 @@ Every stage is a function of frozen data and can be called alone.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 
-from connrsfm_graph.baselines import BASELINES
 from connrsfm_graph.config import as_dict
 from connrsfm_graph.errors import ComputationError
 from connrsfm_graph.image_graph import GraphConfig, ImageGraph, select_edges
@@ -105,13 +103,6 @@ def reconstruct(
     with progress.stage("surfaces"):
         result = _surfaces(tracks, graph, problem, solved, refined)
     return result, _record(tracks, config, graph, warps, problem, solved, refined, progress)
-
-
-METHODS: dict[str, Callable[[Tracks, Config, Progress], tuple[Reconstruction, RunRecord]]] = {
-    "connrsfm": reconstruct,
-    **BASELINES,
-}
-"""Methods by name; a baseline is one more entry."""
 
 
 def make_backend(name: str) -> Backend:

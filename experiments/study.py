@@ -22,9 +22,10 @@ from typing import Any
 import numba
 
 from connrsfm_graph.errors import ComputationError, InputError
+from connrsfm_graph.methods import METHODS
 from connrsfm_graph.metrics import evaluate
 from connrsfm_graph.progress import Progress
-from connrsfm_graph.reconstruct import METHODS, Config, default_config
+from connrsfm_graph.reconstruct import Config, default_config
 from connrsfm_graph.synthetic import spheres
 from connrsfm_graph.tracks import Tracks
 

@@ -69,7 +69,7 @@ def reconstruct_into(
     from connrsfm_graph.config import as_toml
     from connrsfm_graph.errors import InputError
     from connrsfm_graph.files import folder_written_beside
-    from connrsfm_graph.reconstruct import METHODS
+    from connrsfm_graph.methods import METHODS
     from connrsfm_graph.reconstruction import RECORD_FILE, RESULT_FILE
     from connrsfm_graph.tracks import check_reconstructable
 

@@ -103,7 +103,7 @@ def run(arguments: argparse.Namespace) -> None:
 def _reconstruction(arguments: argparse.Namespace, progress: Progress) -> Reconstruction:
     """The one given, or one made now."""
     from connrsfm_graph.errors import InputError
-    from connrsfm_graph.reconstruct import METHODS
+    from connrsfm_graph.methods import METHODS
     from connrsfm_graph.reconstruction import Reconstruction
     from connrsfm_graph.tracks import check_reconstructable, load_tracks
 

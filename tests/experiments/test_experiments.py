@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from connrsfm_graph.reconstruct import METHODS
+from connrsfm_graph.methods import METHODS
 from experiments.__main__ import EXPERIMENTS, TABLES, main
 from experiments.study import SEED, Experiment, Options
 

@@ -10,9 +10,10 @@ import pytest
 from connrsfm_graph.baselines import BASELINES
 from connrsfm_graph.cli.main import main
 from connrsfm_graph.errors import InputError
+from connrsfm_graph.methods import METHODS
 from connrsfm_graph.metrics import evaluate
 from connrsfm_graph.progress import Progress
-from connrsfm_graph.reconstruct import METHODS, Config
+from connrsfm_graph.reconstruct import Config
 from connrsfm_graph.reconstruction import Reconstruction
 from connrsfm_graph.synthetic import isometric_bending, with_missing
 from connrsfm_graph.tracks import load_tracks

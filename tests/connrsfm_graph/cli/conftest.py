@@ -82,8 +82,10 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> None:
     module: Any = types.ModuleType("connrsfm_graph.reconstruct")
     module.Config = Config
     module.default_config = lambda mode: Config(solve=Stage(iterations=10 if mode == "default" else 1))
-    module.METHODS = {"connrsfm": answer, "fail": fail, "interrupt": interrupt}
     monkeypatch.setitem(sys.modules, "connrsfm_graph.reconstruct", module)
+    methods: Any = types.ModuleType("connrsfm_graph.methods")
+    methods.METHODS = {"connrsfm": answer, "fail": fail, "interrupt": interrupt}
+    monkeypatch.setitem(sys.modules, "connrsfm_graph.methods", methods)
 
 
 @dataclass(frozen=True)
