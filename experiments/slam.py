@@ -8,7 +8,7 @@ compared in one world frame with
     rigid                     the same fusion in the belief that the surface does not move
     fused, odometry only      no background: minimum deformation decides
     fused                     odometry and background
-    incremental               the views one by one with a fixed lag, no background
+    incremental               the views one by one with a fixed lag, no background; the first 60 together
 
 ATE and RPE are those of the camera in the world's unit (the sheet is 2 wide, the path about 4 long), after alignment by
 rotation and translation; the surface error is the root mean square distance of map points to the truth, in the frame of

@@ -37,6 +37,8 @@ class IncrementalConfig:
     """How the map moves."""
     lag: int = 15
     """Views that are estimated together, the newest included."""
+    bootstrap: int = 60
+    """Until this many views have come all of them are estimated together: what is held too early holds a wrong scale."""
     scale_sigma: float = 1.0
     """Standard deviation of the first view's log scale: what is known of the unit before odometry tells."""
     levenberg: Levenberg = field(default_factory=lambda: Levenberg(max_iterations=10, tolerance=1e-3))
@@ -45,6 +47,10 @@ class IncrementalConfig:
     def __post_init__(self) -> None:
         if self.lag < 2:
             raise InputError(f"incremental lag is {self.lag}, expected at least 2")
+
+    def first_free(self, number: int) -> int:
+        """The oldest view that is estimated together with view `number`."""
+        return 0 if number < self.bootstrap else max(0, number - self.lag + 1)
 
 
 class IncrementalFusion:
@@ -211,7 +217,7 @@ class _Window:
     ):
         self.fusion = fusion
         config = fusion.config
-        first = max(0, number - config.lag + 1)
+        first = config.first_free(number)
         views = [*fusion.views, newest]
         self.points = np.unique(np.concatenate([view.points for view in views[first:]]))
         rows = {n: list(range(len(views[n].points))) for n in range(first, number + 1)}
@@ -272,7 +278,7 @@ class _Window:
 
         direct = found(cameras)
         graph = gtsam.NonlinearFactorGraph()
-        for n in range(max(1, number - fusion.config.lag + 1), number + 1):
+        for n in range(max(1, fusion.config.first_free(number)), number + 1):
             graph.add(link_scales(n - 1, n, fusion.noise))
         factors = [fusion.graph.at(n) for n in direct] + [new.at(n) for n in range(new.size())]
         others = {k for factor in factors for k in factor.keys() if not _is_camera(k)}

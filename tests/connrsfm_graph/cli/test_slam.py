@@ -1,0 +1,100 @@
+"""The command `slam`, on a finished reconstruction: what it writes, and what it refuses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from connrsfm_graph.reconstruction import Reconstruction
+from connrsfm_graph.slam import load_problem, read_tum, solve_problem, trajectory_error, write_tum
+from connrsfm_graph.slam.trajectory import chained
+from connrsfm_graph.synthetic.passing_camera import noisy_odometry, passing_camera, relative_depth
+from connrsfm_graph.synthetic.scene import INTRINSICS
+
+F, P, B = 15, 30, 20
+
+
+@pytest.fixture
+def scene():
+    return passing_camera(F, P, B)
+
+
+@pytest.fixture
+def files(tmp_path: Path, scene) -> dict[str, Path]:
+    """Tracks, result, odometry and background of one sequence."""
+    rng = np.random.default_rng(0)
+    image = scene.image + 1e-3 * rng.normal(size=scene.image.shape)
+    depth = np.exp(relative_depth(scene))
+    points = depth[..., None] * np.concatenate([image, np.ones((F, P, 1))], axis=-1)
+    pixels = image * INTRINSICS[0, 0] + INTRINSICS[:2, 2]
+    paths = {name: tmp_path / name for name in ("tracks.npz", "result.npz", "odometry.tum", "background.npz")}
+    np.savez(paths["tracks.npz"], tracks=pixels, K=INTRINSICS)
+    nothing = np.full((F, P), np.nan)
+    Reconstruction(
+        pixels=pixels,
+        K=np.tile(INTRINSICS, (F, 1, 1)),
+        visible=np.ones((F, P), dtype=bool),
+        points=points,
+        normals=np.tile([0.0, 0.0, -1.0], (F, P, 1)),
+        depth=depth,
+        first_order=np.zeros((F, P, 2)),
+        second_order=np.zeros((F, P, 3)),
+        edges=np.array([[0, 1]]),
+        edge_weight=np.ones(1),
+        conformal_scale=np.ones((1, P)),
+        depth_std=nothing,
+        log_factor=nothing,
+        interpolated=np.zeros((F, P), dtype=bool),
+        outlier=np.zeros((F, P), dtype=bool),
+    ).save(paths["result.npz"])
+    steps, _ = noisy_odometry(scene.poses)
+    write_tum(paths["odometry.tum"], chained(steps, scene.poses[0]), np.arange(F) / 30.0)
+    seen = np.where(scene.background_visible[..., None], scene.background_image, np.nan)
+    np.savez(paths["background.npz"], tracks=seen * INTRINSICS[0, 0] + INTRINSICS[:2, 2], K=INTRINSICS)
+    return paths
+
+
+def test_trajectory_map_and_problem(connrsfm, files, scene, tmp_path):
+    out = tmp_path / "out"
+    ended = connrsfm(
+        *("slam", files["tracks.npz"], "--result", files["result.npz"], "--out", out),
+        *("--odometry", files["odometry.tum"], "--background", files["background.npz"]),
+    )
+    assert ended.status == 0, ended.err
+    assert "in the unit of odometry" in ended.out
+    times, poses = read_tum(out / "trajectory.tum")
+    np.testing.assert_allclose(times, np.arange(F) / 30.0, atol=1e-8)
+    _, odometry = read_tum(files["odometry.tum"])
+    assert trajectory_error(poses, scene.poses).ate < trajectory_error(odometry, scene.poses).ate
+    assert (out / "map.ply").read_bytes().startswith(b"ply\n")
+    np.testing.assert_allclose(solve_problem(load_problem(out / "problem.npz")).poses, poses, atol=1e-6)
+
+
+def test_without_odometry_the_unit_is_the_reconstructions(connrsfm, files, tmp_path):
+    ended = connrsfm("slam", files["tracks.npz"], "--result", files["result.npz"], "--out", tmp_path / "out")
+    assert ended.status == 0, ended.err
+    assert "in the unit of the first view's reconstruction" in ended.out
+
+
+def test_reconstructs_where_no_result_is_given(connrsfm, files, tmp_path):
+    ended = connrsfm("slam", files["tracks.npz"], "--out", tmp_path / "out", "--odometry", files["odometry.tum"])
+    assert ended.status == 0, ended.err
+
+
+def test_bad_input_is_one_sentence_and_writes_nothing(connrsfm, files, tmp_path):
+    out = tmp_path / "out"
+    short = tmp_path / "short.tum"
+    short.write_text("0 0 0 0 0 0 0 1\n")
+    given = ("slam", files["tracks.npz"], "--result", files["result.npz"], "--out", out)
+    for more, message in (
+        (("--odometry", short), "short.tum: holds 1 poses, expected one per view, 15"),
+        (("--odometry", tmp_path / "none.tum"), "none.tum: no such file"),
+        (("--odometry-rotation", "-1"), "odometry_rotation_deg is -1.0, expected a positive number"),
+    ):
+        ended = connrsfm(*given, *more)
+        assert ended.status == 2
+        assert message in ended.err
+        assert "Traceback" not in ended.err
+    assert not out.exists()
