@@ -21,7 +21,7 @@ from connrsfm_graph.metrics.alignment import align_similarity
 from connrsfm_graph.slam.assemble import MapModel, link_scales, pose_key
 from connrsfm_graph.slam.elimination import MapState, MapTerms
 from connrsfm_graph.slam.fuse import GAUGE_SIGMA, Columns, Fused, FusionConfig, camera_arrays, fuse, minimise
-from connrsfm_graph.slam.sightings import FusionNoise, Sightings, View
+from connrsfm_graph.slam.sightings import FusionNoise, Sightings, View, stacked
 from connrsfm_graph.solvers.interface import Levenberg
 from factors.keys import CAMERA_POSE, LOG_DEPTH, MAP_POINT, VIEW_SCALE, decode, describe, key
 
@@ -38,7 +38,7 @@ class IncrementalConfig:
     lag: int = 15
     """Views that are estimated together, the newest included."""
     bootstrap: int = 60
-    """Until this many views have come all of them are estimated together: what is held too early holds a wrong scale."""
+    """Until this many views have come all are estimated together: what is held too early holds a wrong scale."""
     scale_sigma: float = 1.0
     """Standard deviation of the first view's log scale: what is known of the unit before odometry tells."""
     levenberg: Levenberg = field(default_factory=lambda: Levenberg(max_iterations=10, tolerance=1e-3))
@@ -164,7 +164,7 @@ class IncrementalFusion:
     def sightings(self) -> Sightings:
         """What all views saw, points numbered from 0."""
         size = 1 + max((int(view.points.max(initial=-1)) for view in self.views), default=-1)
-        return _stacked(self.views, [np.arange(len(view.points)) for view in self.views], np.arange(size))
+        return stacked(self.views, [np.arange(len(view.points)) for view in self.views], np.arange(size))
 
     def finish(self, config: FusionConfig | None = None) -> Fused:
         """The batch fusion of everything so far, from the current estimate."""
@@ -229,7 +229,7 @@ class _Window:
         self.numbers = sorted(rows)
         self.rows = [np.array(rows[n], dtype=int) for n in self.numbers]
         held = np.array(self.numbers) < first
-        sightings = _stacked([views[n] for n in self.numbers], self.rows, self.points)
+        sightings = stacked([views[n] for n in self.numbers], self.rows, self.points)
         self.terms = MapTerms(sightings, fusion.noise, config.map, np.array(self.numbers), held)
 
         free = {k for n in range(first, number + 1) for k in _camera(n)}
@@ -294,19 +294,6 @@ def _camera(view: int) -> tuple[int, int]:
 
 def _is_camera(k: int) -> bool:
     return decode(k)[0] in (CAMERA_POSE, VIEW_SCALE)
-
-
-def _stacked(views: list[View], rows: list[np.ndarray], points: np.ndarray) -> Sightings:
-    """Some rows of some views as arrays over (view, point); `points` are the numbers of the columns, ascending."""
-    shape = len(views), len(points)
-    image, seen = np.zeros((*shape, 2)), np.zeros(shape, dtype=bool)
-    log_depth, depth_std = np.zeros(shape), np.full(shape, np.nan)
-    for n, (view, row) in enumerate(zip(views, rows, strict=True)):
-        column = np.searchsorted(points, view.points[row])
-        seen[n, column] = True
-        image[n, column], log_depth[n, column] = view.image[row], view.log_depth[row]
-        depth_std[n, column] = view.depth_std[row]
-    return Sightings(image, seen, log_depth, depth_std)
 
 
 def _try_out(graph: gtsam.NonlinearFactorGraph, new: gtsam.Values, values: gtsam.Values) -> None:

@@ -157,6 +157,19 @@ class Sightings:
         return View(points, self.image[view, points], self.log_depth[view, points], self.depth_std[view, points])
 
 
+def stacked(views: list[View], rows: list[np.ndarray], points: np.ndarray) -> Sightings:
+    """Some rows of some views as arrays over (view, point); `points` are the numbers of the columns, ascending."""
+    shape = len(views), len(points)
+    image, seen = np.zeros((*shape, 2)), np.zeros(shape, dtype=bool)
+    log_depth, depth_std = np.zeros(shape), np.full(shape, np.nan)
+    for n, (view, row) in enumerate(zip(views, rows, strict=True)):
+        column = np.searchsorted(points, view.points[row])
+        seen[n, column] = True
+        image[n, column], log_depth[n, column] = view.image[row], view.log_depth[row]
+        depth_std[n, column] = view.depth_std[row]
+    return Sightings(image, seen, log_depth, depth_std)
+
+
 def estimate_noise(sightings: Sightings, image_sigma: float | None = None) -> FusionNoise:
     """Noise levels from the fit of neighbouring views onto each other, without any truth.
 
