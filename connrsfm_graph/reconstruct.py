@@ -158,6 +158,8 @@ def _surfaces(
         interpolated=recovered & ~(problem.constrained().T & visible),
         outlier=outlier,
         image_names=None if tracks.image_names is None else np.asarray(tracks.image_names),
+        ambiguous=None if refined is None or refined.alternative is None else refined.ambiguous,
+        alternative=None if refined is None else refined.alternative,
     )
 
 

@@ -60,6 +60,11 @@ class Reconstruction:
     """(F, P) bool, observed but judged a wrong track."""
     image_names: np.ndarray | None = None
     """(F,) names of the images, or None where the tracks had none."""
+    ambiguous: np.ndarray | None = None
+    """(F,) int, of a conformal surface: 0 for images whose surface is decided; those of the same positive number may be
+    inverted about the camera centre, but only together. None where no image is ambiguous."""
+    alternative: np.ndarray | None = None
+    """(F, P, 3) the points with all ambiguous images inverted; None where no image is ambiguous."""
 
     @property
     def n_frames(self) -> int:
@@ -104,7 +109,10 @@ class Reconstruction:
             raise InputError(f"{path}: 'image_names' is not a list of {sizes['F']} names")
         if known["edges"].size and not np.isin(known["edges"], np.arange(sizes["F"])).all():
             raise InputError(f"{path}: 'edges' names an image outside 0 to {sizes['F'] - 1}")
-        return Reconstruction(**known, image_names=names)
+        optional = {
+            name: _checked(arrays, name, spec, sizes, str(path)) for name, spec in _OPTIONAL.items() if name in arrays
+        }
+        return Reconstruction(**known, **optional, image_names=names)
 
 
 # Shape by symbol (numbers are literal) and kind of every field of the file.
@@ -124,6 +132,10 @@ _LAYOUT: dict[str, tuple[tuple[str | int, ...], type]] = {
     "log_factor": (("F", "P"), float),
     "interpolated": (("F", "P"), bool),
     "outlier": (("F", "P"), bool),
+}
+_OPTIONAL: dict[str, tuple[tuple[str | int, ...], type]] = {
+    "ambiguous": (("F",), int),
+    "alternative": (("F", "P", 3), float),
 }
 _KINDS = {float: ("fiu", "numbers"), int: ("iu", "whole numbers"), bool: ("b", "true and false")}
 

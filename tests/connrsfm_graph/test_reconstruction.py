@@ -35,6 +35,8 @@ def small_reconstruction(names: bool = True) -> Reconstruction:
         interpolated=np.zeros((F, P), bool),
         outlier=np.zeros((F, P), bool),
         image_names=np.array(["a.jpg", "b.jpg", "c.jpg"]) if names else None,
+        ambiguous=np.array([0, 1, 1]) if names else None,
+        alternative=points[:, ::-1] if names else None,
     )
 
 
@@ -72,6 +74,7 @@ def damaged(path: Path, **changes: object) -> None:
         ({"depth": np.zeros((3, 4))}, r"'depth' has shape \(3, 4\), expected \(3, 5\)"),
         ({"visible": np.zeros((3, 5))}, "'visible' holds float64 values, expected true and false"),
         ({"depth": np.full((3, 5), "x")}, "'depth' holds <U1 values, expected numbers"),
+        ({"ambiguous": np.zeros(4, int)}, r"'ambiguous' has shape \(4,\), expected \(3\)"),
         ({"edges": np.array([[0, 7], [1, 2]])}, "'edges' names an image outside 0 to 2"),
         ({"image_names": np.array(["a"])}, "'image_names' is not a list of 3 names"),
         ({"depth": np.array([{}] * 15).reshape(3, 5)}, "'depth' holds Python objects"),
