@@ -3,6 +3,7 @@
 from connrsfm_graph.slam.assemble import MapModel, add_reconstruction, pose_key
 from connrsfm_graph.slam.fuse import Fused, FusionConfig, fuse
 from connrsfm_graph.slam.incremental import IncrementalConfig, IncrementalFusion
+from connrsfm_graph.slam.keyframes import KeyframeConfig, Keyframes
 from connrsfm_graph.slam.run import SlamConfig, pose_problem, solve_problem
 from connrsfm_graph.slam.sightings import FusionNoise, Sightings, View, estimate_noise
 from connrsfm_graph.slam.storage import FusionProblem, load_problem, save_problem, write_map
@@ -15,6 +16,8 @@ __all__ = [
     "FusionProblem",
     "IncrementalConfig",
     "IncrementalFusion",
+    "KeyframeConfig",
+    "Keyframes",
     "MapModel",
     "Sightings",
     "SlamConfig",

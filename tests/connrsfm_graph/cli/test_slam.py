@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from connrsfm_graph.reconstruction import Reconstruction
+from connrsfm_graph.progress import Progress
 from connrsfm_graph.slam import load_problem, read_tum, solve_problem, trajectory_error, write_tum
 from connrsfm_graph.slam.trajectory import chained
 from connrsfm_graph.synthetic.passing_camera import noisy_odometry, passing_camera, relative_depth
 from connrsfm_graph.synthetic.scene import INTRINSICS
+from connrsfm_graph.tracks import load_tracks
+from tests.connrsfm_graph.cli.conftest import Config, answer
 
 F, P, B = 15, 30, 20
 
@@ -31,24 +34,8 @@ def files(tmp_path: Path, scene) -> dict[str, Path]:
     pixels = image * INTRINSICS[0, 0] + INTRINSICS[:2, 2]
     paths = {name: tmp_path / name for name in ("tracks.npz", "result.npz", "odometry.tum", "background.npz")}
     np.savez(paths["tracks.npz"], tracks=pixels, K=INTRINSICS)
-    nothing = np.full((F, P), np.nan)
-    Reconstruction(
-        pixels=pixels,
-        K=np.tile(INTRINSICS, (F, 1, 1)),
-        visible=np.ones((F, P), dtype=bool),
-        points=points,
-        normals=np.tile([0.0, 0.0, -1.0], (F, P, 1)),
-        depth=depth,
-        first_order=np.zeros((F, P, 2)),
-        second_order=np.zeros((F, P, 3)),
-        edges=np.array([[0, 1]]),
-        edge_weight=np.ones(1),
-        conformal_scale=np.ones((1, P)),
-        depth_std=nothing,
-        log_factor=nothing,
-        interpolated=np.zeros((F, P), dtype=bool),
-        outlier=np.zeros((F, P), dtype=bool),
-    ).save(paths["result.npz"])
+    bowl, _ = answer(load_tracks(paths["tracks.npz"]), Config(), Progress())
+    replace(bowl, points=points, depth=depth).save(paths["result.npz"])
     steps, _ = noisy_odometry(scene.poses)
     write_tum(paths["odometry.tum"], chained(steps, scene.poses[0]), np.arange(F) / 30.0)
     seen = np.where(scene.background_visible[..., None], scene.background_image, np.nan)
