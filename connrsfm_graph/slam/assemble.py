@@ -4,7 +4,8 @@ What camera motion is and what deformation decides the prior on motion. It is is
 so of all explanations of the images that differ by a motion of camera and surface together, the one in which the
 surface's points move least (in sum of squares) is the cheapest: **minimum deformation**. Every rigid landmark, prior
 or odometry factor adds its own cost to that of moving the camera, and a **rigid background decides**: its image points
-are known to a fraction of a pixel, the motion prior is worth a few per cent of the depth.
+are known to a fraction of a pixel, the motion prior is worth a few per cent of the depth. It decides what it sees: the
+camera's rotation always, its translation as far as the background shows parallax.
 """
 
 from __future__ import annotations

@@ -4,6 +4,9 @@ Levenberg-Marquardt over all variables by the rule of `solvers.interface`. The m
 (`elimination`), everything else - odometry, priors, rigid landmarks, factors of the user - is a GTSAM graph that GTSAM
 linearises. Both together are the graph of `assemble.add_reconstruction`, with the same minimum.
 
+The equations of cameras and other variables are dense, 7 columns per view: made for hundreds of views, and for
+landmarks by the hundred.
+
 Gauge: where no factor of one pose alone is given the first pose is held, and where no factor between poses gives a
 length the scale of the first view. See `assemble` for what decides between motion of the camera and deformation.
 """
