@@ -82,6 +82,7 @@ def fuse(
     values: gtsam.Values,
     config: FusionConfig | None = None,
     progress: Callable[[int, int], None] | None = None,
+    settle: bool = True,
 ) -> Fused:
     """Fuse a reconstruction with what is known about the cameras.
 
@@ -93,6 +94,7 @@ def fuse(
         values: start of the poses of all views and of the graph's other variables; scales start at 0 unless given.
         config: settings.
         progress: called with (accepted steps, most steps).
+        settle: minimise over the given factors alone first; not where the cameras start from an estimate with the map.
 
     Raises:
         InputError: a view sees nothing and no factor holds it, a pose or variable has no start, the graph holds
@@ -103,8 +105,8 @@ def fuse(
     rest = _with_gauge(graph, values, sightings, noise)
     cameras = [k for view in range(sightings.n_views) for k in (pose_key(view), key(VIEW_SCALE, 0, view))]
     start = _start_values(rest, values, cameras)
-    # What is known without the map first: a landmark that cameras turn away from must not pull at the surface.
-    start, _, _ = levenberg_marquardt(rest, start, config.levenberg)
+    if settle:  # a landmark that cameras turn away from must not pull at the surface
+        start, _, _ = levenberg_marquardt(rest, start, config.levenberg)
     terms = MapTerms(sightings, noise, config.map)
     state = terms.start(*camera_arrays(start, range(sightings.n_views)))
     columns = Columns(rest, start, cameras)

@@ -168,7 +168,8 @@ class IncrementalFusion:
 
     def finish(self, config: FusionConfig | None = None) -> Fused:
         """The batch fusion of everything so far, from the current estimate."""
-        return fuse(self.sightings(), self.noise, self.graph, self.values, config or FusionConfig(map=self.config.map))
+        config = config or FusionConfig(map=self.config.map)
+        return fuse(self.sightings(), self.noise, self.graph, self.values, config, settle=False)
 
     def _predicted(self, view: View, step: np.ndarray | None) -> tuple[gtsam.Pose3, float]:
         """Pose and log scale to start a view from: by odometry, or by the map as it was last seen."""
