@@ -152,9 +152,9 @@ def _gather(border, weight, ends, x, v):
 
 @njit(cache=True, nogil=True)
 def _spread_all(begin, end, border, weight, ends, v, x):
-    """x_f += W_f v for views begin to end - 1."""
+    """x_f += W_f v_f for views begin to end - 1."""
     for f in range(begin, end):
-        _spread(border[f], weight[f], ends, v, x[f])
+        _spread(border[f], weight[f], ends, v[f], x[f])
 
 
 @njit(cache=True, nogil=True)
@@ -210,8 +210,9 @@ class Factorised:
         return x
 
     def spread(self, v: np.ndarray) -> np.ndarray:
-        """W_f v for all views, shape (F, n), from (E,)."""
+        """W_f v_f for all views, shape (F, n), from (F, E) or from (E,), the same for all."""
         x = np.zeros_like(self.equations.gradient)
+        v = np.broadcast_to(v, self.equations.weight.shape)
         over_views(_spread_all, len(x), self.equations.border, self.equations.weight, self.ends, v, x)
         return x
 
@@ -251,6 +252,12 @@ class Factorised:
 
     def step(self, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
         """Gauss-Newton step: (F, n) of the views' unknowns and (E,) of the lengths."""
-        inner = self.solve_views(self.equations.gradient)
-        lengths = self.solve_lengths(self.gather(inner) - self.equations.length_gradient, tolerance)
+        return self.solve(self.equations.gradient, self.equations.length_gradient, tolerance)
+
+    def solve(
+        self, gradient: np.ndarray, length_gradient: np.ndarray, tolerance: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Minus the inverse of the whole matrix times (F, n) and (E,)."""
+        inner = self.solve_views(gradient)
+        lengths = self.solve_lengths(self.gather(inner) - length_gradient, tolerance)
         return -inner - self.solve_views(self.spread(lengths)), lengths

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ from connrsfm_graph.refine.ambiguity import Ambiguity, resolve
 from connrsfm_graph.refine.config import RefineConfig
 from connrsfm_graph.refine.cost import Weights
 from connrsfm_graph.refine.mesh import Mesh
-from connrsfm_graph.refine.noise import Noise
+from connrsfm_graph.refine.noise import Noise, neighbour_correlation
 from connrsfm_graph.refine.restarts import inverted, restart
 from connrsfm_graph.refine.solve import Measurements, Shape, costs, lag, linearise, minimise
 from connrsfm_graph.refine.start import start_mesh, start_shape
@@ -25,8 +25,10 @@ _FACTOR = 0.1
 """Inverse standard deviation of log conformal factors."""
 _DECLARED_FACTOR = 1e3
 """The same for views declared isometric."""
-_ROUNDS = 4
-"""Fits with noise levels that the one before has shown."""
+_ROUNDS = 3
+"""Fits with noise levels that the one before has shown, at most."""
+_HALVINGS = 2
+"""How often the assumed length noise may be halved."""
 _RESTARTS = 4
 """Rounds of restarts in the conformal model, at most."""
 _CAUGHT = 3.0
@@ -73,7 +75,7 @@ class Task:
             image=self.completed.image,
             image_weight=noise.image_weight(self.seen, self.completed.deviation),
             log_depth=start_shape(self.completed, self.mesh).log_depth,
-            length_weight=np.full((len(self.seen), len(self.mesh.edges)), 1.0 / config.length_sigma),
+            length_weight=np.full((len(self.seen), len(self.mesh.edges)), 1.0 / noise.length),
             factor_weight=np.where(self.declared, _DECLARED_FACTOR, _FACTOR),
             mesh=self.mesh,
             weights=Weights(
@@ -97,6 +99,8 @@ class Fit:
     """Cost at the start and after every iteration, run after run."""
     first_cost: float
     """Cost of the best shape under the noise levels of the start."""
+    noisy: bool = True
+    """Whether the ray corrections look like noise."""
     evidence: dict[str, Any] = field(default_factory=dict)
     """What the choices rest on."""
     ambiguity: Ambiguity | None = None
@@ -121,7 +125,7 @@ def fit(task: Task, sigma_image: float) -> Fit:
         task: what is to be fitted.
         sigma_image: standard deviation of the image points, normalised coordinates; NaN where not known.
     """
-    noise = Noise.start(sigma_image, task.spacing())
+    noise = Noise.start(sigma_image, task.config.length_sigma, task.spacing())
     wanted = task.config.model
     if wanted == "conformal":
         return fit_conformal(task, noise)
@@ -177,16 +181,7 @@ def fit_conformal(task: Task, noise: Noise) -> Fit:
     found = _settled(task, Fit(measurements, shape, noise, history, history[-1]))
     found.evidence["conformal factors rest on"] = ambiguity.assumption
     found.evidence["views that might be inverted"] = np.flatnonzero(ambiguity.group).tolist()
-    return Fit(
-        found.measurements,
-        found.shape,
-        found.noise,
-        found.history,
-        found.first_cost,
-        found.evidence,
-        ambiguity,
-        alternative,
-    )
+    return replace(found, ambiguity=ambiguity, alternative=alternative)
 
 
 def _minimise(task: Task, measurements: Measurements, shape: Shape) -> tuple[Shape, list[float]]:
@@ -194,22 +189,49 @@ def _minimise(task: Task, measurements: Measurements, shape: Shape) -> tuple[Sha
 
 
 def _settled(task: Task, found: Fit) -> Fit:
-    """The fit after its noise levels have settled."""
-    for _ in range(_ROUNDS - 1):
-        noise = found.noise.updated(found.shape.correction[task.seen], found.residuals() / task.config.length_sigma)
+    """The fit with the noise levels that the data show.
+
+    Where the ray corrections look like noise, the image noise stands and the lengths are trusted more, as long as that
+    remains so. Where they do not, the image noise was assumed too large.
+    """
+    noisy = _looks_like_noise(task, found)
+    if noisy:
+        best = found
+        for _ in range(_HALVINGS):
+            found = _refitted(task, found, found.noise.after_fit(found.residuals()).halved_length())
+            if _looks_like_noise(task, found):
+                best = found
+        found = best
+    for _ in range(_ROUNDS):
+        noise = found.noise.after_fit(found.residuals())
+        if not noisy:
+            noise = noise.lowered_image(found.shape.correction[task.seen])
         if noise.settled(found.noise):
             break
-        measurements = task.measurements(noise)
-        shape, history = _minimise(task, measurements, found.shape)
-        found = Fit(measurements, shape, noise, found.history + history, found.first_cost, found.evidence)
-    correction = found.shape.correction[task.seen]
-    found.evidence.update(
-        {
-            "image noise": found.noise.sigma,
-            "image noise over image length of an edge": float(np.sqrt(2.0)) * found.noise.sigma / found.noise.spacing,
-            "root mean square ray correction": float(np.sqrt((correction**2).mean())),
-            "median absolute length residual": float(np.median(np.abs(found.residuals()))),
-            "bending": task.config.bending,
-        }
-    )
-    return found
+        found = _refitted(task, found, noise)
+    found.evidence.update(_noise_evidence(task, found))
+    return replace(found, noisy=noisy)
+
+
+def _looks_like_noise(task: Task, found: Fit) -> bool:
+    correlation, error = neighbour_correlation(found.shape.correction, task.seen, task.mesh)
+    return correlation <= error
+
+
+def _refitted(task: Task, found: Fit, noise: Noise) -> Fit:
+    measurements = task.measurements(noise)
+    shape, history = _minimise(task, measurements, found.shape)
+    return replace(found, measurements=measurements, shape=shape, noise=noise, history=found.history + history)
+
+
+def _noise_evidence(task: Task, found: Fit) -> dict[str, Any]:
+    noise, correction = found.noise, found.shape.correction
+    return {
+        "image noise": noise.image,
+        "image noise over image length of an edge": float(np.sqrt(2.0)) * noise.image / noise.spacing,
+        "length noise": noise.length,
+        "root mean square ray correction": float(np.sqrt((correction[task.seen] ** 2).mean())),
+        "correlation of neighbours' ray corrections": neighbour_correlation(correction, task.seen, task.mesh)[0],
+        "median absolute length residual": float(np.median(np.abs(found.residuals()))),
+        "bending": task.config.bending,
+    }

@@ -1,10 +1,17 @@
-"""Noise levels of the refinement, updated by what a fit shows."""
+"""Noise levels of the refinement, and what a fit says about them.
+
+Two levels are to be known, of image points and of lengths, and the sizes of a fit's residuals do not tell them apart:
+what one may not explain the other takes over. What tells is whether the ray corrections look like noise. Noise is
+independent from point to point; a surface that stretches, or a warp's misfit taken for noise, moves neighbours alike.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
 import numpy as np
+
+from connrsfm_graph.refine.mesh import Mesh
 
 _LEAST_IMAGE = 1e-4
 """Smallest image noise, relative to the median image length of a mesh edge."""
@@ -25,47 +32,65 @@ _RAYLEIGH = 1.1774
 class Noise:
     """What a fit assumes."""
 
-    sigma: float
+    image: float
     """Standard deviation of a coordinate of the image points, normalised coordinates."""
+    length: float
+    """Standard deviation of a log length in one view."""
     spacing: float
     """Median image length of a mesh edge."""
     huber: float = _HUBER[2]
-    """Length residuals count linearly beyond this, in units of the assumed standard deviation."""
+    """Length residuals count linearly beyond so many standard deviations."""
     release: float = 1.0
     """Factor on the uncertainty of interpolated image points."""
 
     @staticmethod
-    def start(sigma: float, spacing: float) -> Noise:
+    def start(image: float, length: float, spacing: float) -> Noise:
         """For an estimate of the image noise, NaN where there is none."""
-        return Noise(max(sigma if np.isfinite(sigma) else 0.0, _LEAST_IMAGE * spacing), spacing)
+        return Noise(max(image if np.isfinite(image) else 0.0, _LEAST_IMAGE * spacing), length, spacing)
 
     def image_weight(self, seen: np.ndarray, deviation: np.ndarray) -> np.ndarray:
         """(F, P) inverse standard deviations of seen and interpolated image points."""
-        return 1.0 / np.where(seen, self.sigma, np.maximum(self.sigma, self.release * deviation))
+        return 1.0 / np.where(seen, self.image, np.maximum(self.image, self.release * deviation))
 
-    def updated(self, correction: np.ndarray, residual: np.ndarray) -> Noise:
-        """After a fit.
+    def lowered_image(self, correction: np.ndarray) -> Noise:
+        """With the image noise that ray corrections (N, 2) show, where it was assumed too large.
 
-        The image noise given is an upper bound (a warp's misfit is not all noise), so it is only ever lowered.
-
-        Args:
-            correction: (N, 2) ray corrections of the seen points.
-            residual: length residuals in units of their assumed standard deviation.
+        It is only ever lowered: the estimate given is an upper bound, since a warp's misfit is not all noise.
         """
         shown = float(np.sqrt((correction**2).mean()))
-        sigma = max(shown, _LEAST_IMAGE * self.spacing) if shown < _OVERESTIMATED * self.sigma else self.sigma
+        if shown >= _OVERESTIMATED * self.image:
+            return self
+        return replace(self, image=max(shown, _LEAST_IMAGE * self.spacing))
+
+    def halved_length(self) -> Noise:
+        """With half the length noise."""
+        return replace(self, length=0.5 * self.length)
+
+    def after_fit(self, residual: np.ndarray) -> Noise:
+        """With the robust threshold that length residuals show, and interpolated points released."""
         least, factor, most = _HUBER
-        huber = float(np.clip(factor * 1.4826 * np.median(np.abs(residual)), least, most))
-        return replace(self, sigma=sigma, huber=huber, release=_RELEASE)
+        huber = float(np.clip(factor * 1.4826 * np.median(np.abs(residual)) / self.length, least, most))
+        return replace(self, huber=huber, release=_RELEASE)
 
     def settled(self, last: Noise) -> bool:
         """Whether another fit would change little."""
         return (
             self.release == last.release
-            and abs(self.sigma - last.sigma) <= _SETTLED * last.sigma
+            and abs(self.image - last.image) <= _SETTLED * last.image
             and abs(self.huber - last.huber) <= _SETTLED * last.huber
         )
 
     def gross(self, size: np.ndarray) -> float:
-        """Length (N,) beyond which a ray correction means a wrong track."""
+        """Length beyond which a ray correction means a wrong track, from the lengths (N,) of all."""
         return max(_GROSS[0] * float(np.median(size)) / _RAYLEIGH, _GROSS[1] * self.spacing)
+
+
+def neighbour_correlation(correction: np.ndarray, seen: np.ndarray, mesh: Mesh) -> tuple[float, float]:
+    """Correlation of ray corrections (F, P, 2) of seen neighbours, and its standard error if they are independent."""
+    a, b = mesh.edges[: mesh.n_near].T
+    both = seen[:, a] & seen[:, b]
+    if not both.any():
+        return 0.0, 1.0
+    product = (correction[:, a] * correction[:, b])[both]
+    variance = float((correction[seen] ** 2).mean())
+    return float(product.mean()) / max(variance, 1e-300), 1.0 / float(np.sqrt(product.size))

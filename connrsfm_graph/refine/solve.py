@@ -18,8 +18,8 @@ Progress = Callable[[str], None]
 
 _DAMPING = (1e-3, 1e-7, 1e6)
 """First, smallest and largest damping."""
-_INNER_TOLERANCE = 1e-2
-"""Relative accuracy of the conjugate gradients: the step is corrected by the next iteration anyway."""
+_INNER_TOLERANCE = 0.2
+"""Relative accuracy of the conjugate gradients: what they leave the next iteration corrects, as it does curvature."""
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ import numpy as np
 from connrsfm_graph.errors import InputError
 from connrsfm_graph.refine.config import RefineConfig
 from connrsfm_graph.refine.fit import Fit, Task, fit
+from connrsfm_graph.refine.uncertainty import log_depth_deviation
 from connrsfm_graph.refine.unseen import complete
 from connrsfm_graph.refine.wrong_tracks import wrong_tracks
 
@@ -42,8 +43,8 @@ class Refined:
     model: Literal["isometric", "conformal"]
     """Which model was chosen."""
     ambiguous: np.ndarray
-    """(F,) int, 0 for views that are decided; those of the same positive number may be inverted about the camera centre,
-    X -> X / |X|^2, but only all together. All zero in an isometric model."""
+    """(F,) int, 0 for views that are decided, always so in an isometric model; those of the same positive number may be
+    inverted about the camera centre, X -> X / |X|^2, but only all together."""
     alternative: np.ndarray | None
     """(F, P, 3) the points with all ambiguous views inverted; None where no view is ambiguous."""
     evidence: Mapping[str, Any]
@@ -91,7 +92,7 @@ def refine(
         outlier |= late
     if progress is not None:
         progress(_ATTEMPTS, _ATTEMPTS)
-    return _refined(found, seen, used, outlier)
+    return _refined(found, config, seen, used, outlier)
 
 
 def _checked(
@@ -120,13 +121,16 @@ def _contradicted(found: Fit, seen: np.ndarray) -> np.ndarray:
     return seen & (size > found.noise.gross(size[seen]))
 
 
-def _refined(found: Fit, seen: np.ndarray, used: np.ndarray, outlier: np.ndarray) -> Refined:
+def _refined(found: Fit, config: RefineConfig, seen: np.ndarray, used: np.ndarray, outlier: np.ndarray) -> Refined:
     def all_points(values: np.ndarray) -> np.ndarray:
         full = np.full((len(values), len(used), *values.shape[2:]), np.nan)
         full[:, used] = values
         return full
 
     image, shape = found.measurements.image, found.shape
+    deviation = np.full(seen.shape, np.nan)
+    if config.uncertainty:
+        deviation = log_depth_deviation(found.measurements, shape, stretch=not found.noisy)
     warnings = []
     group = np.zeros(len(seen), dtype=int) if found.ambiguity is None else found.ambiguity.group
     if group.any():
@@ -137,7 +141,7 @@ def _refined(found: Fit, seen: np.ndarray, used: np.ndarray, outlier: np.ndarray
     return Refined(
         points=all_points(shape.points(image)),
         log_depth=all_points(shape.log_depth),
-        depth_std=np.full(outlier.shape, np.nan),
+        depth_std=all_points(deviation * np.exp(shape.log_depth)),
         ray_correction=all_points(np.where(seen[..., None], shape.correction, np.nan)),
         log_factor=all_points(shape.log_factor if found.conformal else np.zeros_like(shape.log_depth)),
         log_length=shape.log_length,

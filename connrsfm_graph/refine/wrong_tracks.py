@@ -13,9 +13,9 @@ from scipy.spatial import cKDTree
 
 _NEIGHBOURS = 12
 """Points from which a position is predicted, at most; at least half as many."""
-_SOURCES = 8
+_SOURCES = 9
 """Other views from which it is predicted, at most."""
-_REWEIGHTINGS = 8
+_REWEIGHTINGS = 6
 """Iterations of the least absolute deviations fit."""
 _CUT = 5.0
 """Disagreement of a wrong track, in units of the neighbours' median error; of 20,000 right ones two exceed it."""
@@ -53,9 +53,8 @@ def disagreement(image: np.ndarray, visible: np.ndarray, trusted: np.ndarray) ->
         shared[f] = 0
         order = np.argsort(-shared, kind="stable")
         order = order[shared[order] > _NEIGHBOURS // 2]
-        # Every point needs several views of its own, and neighbouring views may be alike: go through all, evenly.
         ratios: list[np.ndarray] = []
-        for g in order[np.unique(np.linspace(0, len(order) - 1, min(len(order), 2 * _SOURCES)).astype(int))]:
+        for g in order[np.unique(np.linspace(0, len(order) - 1, min(len(order), _SOURCES)).astype(int))]:
             ratio = np.full(P, np.nan)
             judged = np.flatnonzero(visible[f] & trusted[g])
             base = np.flatnonzero(trusted[f] & trusted[g])
