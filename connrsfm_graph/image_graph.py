@@ -55,12 +55,12 @@ class GraphConfig:
     1, 2, 4, 8, ... images away; doubled until they link all images, if the complete graph does."""
 
     def __post_init__(self) -> None:
-        if self.min_shared < 3:
-            raise ValueError(f"min_shared is {self.min_shared}, expected 3 or more")
-        if self.neighbours < 1:
-            raise ValueError(f"neighbours is {self.neighbours}, expected 1 or more")
-        if self.extra_per_frame < 0 or (self.extra_edges is not None and self.extra_edges < 0):
-            raise ValueError("the number of extra edges is negative, expected 0 or more")
+        if not 0 <= self.extra_per_frame < np.inf:
+            raise InputError(f"graph.extra_per_frame is {self.extra_per_frame}, expected a number from 0")
+        for name, least in (("extra_edges", 0), ("max_extra", 0), ("min_shared", 3), ("neighbours", 1)):
+            value = getattr(self, name)
+            if value is not None and value < least:
+                raise InputError(f"graph.{name} is {value}, expected at least {least}")
 
 
 @dataclass(frozen=True)

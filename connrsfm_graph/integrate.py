@@ -22,7 +22,7 @@ import numpy as np
 from scipy.linalg import cho_solve, cholesky, eigh, solve_triangular
 from scipy.spatial import Delaunay
 
-from connrsfm_graph.errors import ComputationError
+from connrsfm_graph.errors import ComputationError, InputError
 from connrsfm_graph.problem import Problem, State
 from connrsfm_graph.warps.basis import UU, UV, VALUE, VV, SplineGrid, U, V
 from factors.depth_gradient import depth_graph, solve_depth
@@ -46,6 +46,14 @@ class IntegrationConfig:
     """Control points of the spline per axis, at most; fewer for few points."""
     huber: float = 2.0
     """Robust threshold on the terms' residual, in units of its median absolute deviation; spline only."""
+
+    def __post_init__(self) -> None:
+        if self.bending is not None and not 0 <= self.bending < np.inf:
+            raise InputError(f"integrate.bending is {self.bending}, expected a number from 0, or none")
+        if not 5 <= self.control_points <= 40:
+            raise InputError(f"integrate.control_points is {self.control_points}, expected 5 to 40")
+        if not self.huber > 0:
+            raise InputError(f"integrate.huber is {self.huber}, expected a positive number")
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from connrsfm_graph.config import as_dict
 from connrsfm_graph.errors import ComputationError
@@ -32,6 +33,8 @@ from connrsfm_graph.warps.cycles import cycle_agreement
 from factors.noise import PairNoise
 from factors.surface import PERSPECTIVE, normals
 
+NOISY = 0.05
+"""Misfit of the warps, relative to the points' spread, from which the user is warned."""
 METRIC_ONLY = PairNoise(intrinsic=math.inf, extrinsic=math.inf)
 """For the scale of a finished surface: only the metric rows hold for every conformal map."""
 
@@ -66,10 +69,13 @@ def default_config(mode: Literal["default", "paper"] = "default") -> Config:
     return Config(warps=WarpConfig(model="schwarzian"), solve=SolveConfig(schedule="separable"), refinement=False)
 
 
+@threadpool_limits.wrap(limits=1, user_api="blas")
 def reconstruct(
     tracks: Tracks, config: Config | None = None, progress: Progress | None = None
 ) -> tuple[Reconstruction, RunRecord]:
     """Reconstruct the surface of every image.
+
+    The dense systems are small and many: threads run over points and images in compiled code, BLAS is held to one.
 
     Args:
         tracks: checked tracks (see `tracks.check_reconstructable` for what makes them reconstructable).
@@ -88,6 +94,7 @@ def reconstruct(
     with progress.stage("warps"):
         warps = fit_warps(image, visible, graph.edges, config.warps, progress.update)
     problem = make_problem(image, visible, graph.edges, warps.jets, warps.weight * warps.valid)
+    _refuse_unrelated(problem, warps)
     backend = make_backend(config.solve.backend)
     with progress.stage("pre-step"):
         start = initialise(problem, backend, config.solve.levenberg, config.start, config.seed)
@@ -108,6 +115,17 @@ def reconstruct(
 def make_backend(name: str) -> Backend:
     """The solver of the point-wise problem by name."""
     return GtsamBackend() if name == "gtsam" else BatchedBackend()
+
+
+def _refuse_unrelated(problem: Problem, warps: Warps) -> None:
+    """Say why an image has no usable warp, before integration finds nothing there."""
+    for frame in np.flatnonzero(problem.constrained().sum(axis=0) < 3):
+        mine = np.flatnonzero((warps.edges == frame).any(axis=1))
+        reasons = [warps.reports[e].problem for e in mine if warps.reports[e].problem]
+        raise ComputationError(
+            f"image {frame} cannot be related to any other: {reasons[0] if reasons else 'no warp is usable'}; "
+            "check its tracks for gross errors, or leave it out"
+        )
 
 
 def _surfaces(
@@ -183,6 +201,12 @@ def _record(
     if len(suspects):
         pairs = ", ".join(f"{a}-{b}" for a, b in warps.edges[suspects[:5]])
         warnings.append(f"{len(suspects)} warps disagree with the others around cycles of the image graph ({pairs})")
+    spread = float(np.nanmedian(np.nanstd(tracks.pixels, axis=1)))
+    if (misfit := (_median(warps.residual) or 0.0) * tracks.focal_length()) > NOISY * spread:
+        warnings.append(
+            f"the tracks are very noisy or no smooth surface: warps miss by {misfit:.3g} pixels, "
+            f"{misfit / spread:.0%} of the points' spread"
+        )
     decisions: dict[str, Any] = {
         "warp model": sorted({report.model for report in warps.reports}),
         "edges": {"tree": graph.n_tree, "extra": len(graph.edges) - graph.n_tree},

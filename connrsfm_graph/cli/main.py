@@ -7,6 +7,7 @@ whatever went wrong is one sentence on standard error.
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 from typing import NoReturn
@@ -19,16 +20,22 @@ COMMANDS = (demo, track, reconstruct, slam, evaluate, report, settings)
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run `connrsfm` with these arguments (the process's own where None) and return the exit status."""
+    # Read when numpy is loaded, which the commands do: many small matrices gain nothing from threads of BLAS.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         arguments = build_parser().parse_args(argv)
     except SystemExit as stop:  # argparse has printed help or what is wrong
         return int(stop.code or 0)
+    except KeyboardInterrupt:
+        return 130
     try:
         arguments.run(arguments)
     except InputError as error:
         return _ended(arguments, str(error), 2)
     except ComputationError as error:
         return _ended(arguments, str(error), 1)
+    except OSError as error:
+        return _ended(arguments, f"{error.filename or 'file'}: {error.strerror or error}", 2)
     except KeyboardInterrupt:
         return _ended(arguments, "interrupted; unfinished results were removed", 130)
     except Exception as error:

@@ -71,6 +71,7 @@ def reconstruct_into(
     from connrsfm_graph.files import folder_written_beside
     from connrsfm_graph.methods import METHODS
     from connrsfm_graph.reconstruction import RECORD_FILE, RESULT_FILE
+    from connrsfm_graph.report.page import remove_report
     from connrsfm_graph.tracks import check_reconstructable
 
     if method not in METHODS:
@@ -86,6 +87,7 @@ def reconstruct_into(
         reconstruction.save(part / RESULT_FILE)
         record.save(part / RECORD_FILE)
         (part / CONFIG_FILE).write_text(as_toml(config), encoding="utf-8")
+    remove_report(out)
     for warning in warnings:
         print(f"warning: {warning}", file=sys.stderr)
     evaluation, truth = None, tracks.points

@@ -107,9 +107,15 @@ def _reconstruction(arguments: argparse.Namespace, progress: Progress) -> Recons
     from connrsfm_graph.reconstruction import Reconstruction
     from connrsfm_graph.tracks import check_reconstructable, load_tracks
 
-    if arguments.result is not None:
-        return Reconstruction.load(arguments.result)
     tracks = load_tracks(arguments.tracks, arguments.intrinsics)
+    if arguments.result is not None:
+        loaded = Reconstruction.load(arguments.result)
+        if loaded.visible.shape != tracks.visible.shape:
+            raise InputError(
+                f"{arguments.result}: holds {loaded.n_frames} images and {loaded.n_points} points, expected those of "
+                f"{arguments.tracks} ({tracks.n_frames} and {tracks.n_points})"
+            )
+        return loaded
     tracks, _ = check_reconstructable(tracks, str(arguments.tracks))
     try:
         reconstruction, _ = METHODS["connrsfm"](tracks, resolved(arguments), progress)

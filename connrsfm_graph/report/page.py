@@ -6,6 +6,7 @@ import base64
 import html
 import json
 import math
+import shutil
 from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
@@ -26,6 +27,12 @@ REPORT_FILE = "report.html"
 PICTURES_FOLDER = "pictures"
 MAX_FRAMES = 12
 """Images shown as pictures, spread evenly over the sequence; the turning view holds all."""
+
+
+def remove_report(out: Path) -> None:
+    """Remove the page of an earlier result from a folder, so that none stands beside results it does not show."""
+    (out / REPORT_FILE).unlink(missing_ok=True)
+    shutil.rmtree(out / PICTURES_FOLDER, ignore_errors=True)
 
 
 def write_report(

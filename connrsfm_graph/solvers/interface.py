@@ -17,6 +17,7 @@ from typing import Protocol
 
 import numpy as np
 
+from connrsfm_graph.errors import InputError
 from connrsfm_graph.problem import Problem, State
 from factors.noise import PairNoise
 
@@ -45,6 +46,14 @@ class Levenberg:
     """Relative decrease of a point's cost at which it has converged."""
     damping: float = 1e-3
     """Initial damping, added to the diagonal of the normal equations."""
+
+    def __post_init__(self) -> None:
+        if self.max_iterations < 0:
+            raise InputError(f"levenberg.max_iterations is {self.max_iterations}, expected 0 or more")
+        if not 0 <= self.tolerance < 1:
+            raise InputError(f"levenberg.tolerance is {self.tolerance}, expected 0 or more, below 1")
+        if not 0 <= self.damping <= MAX_DAMPING:
+            raise InputError(f"levenberg.damping is {self.damping}, expected 0 to {MAX_DAMPING:g}")
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from typing import Literal
 
 import numpy as np
 
+from connrsfm_graph.errors import InputError
 from connrsfm_graph.initialise import with_closed_form_scale
 from connrsfm_graph.integrate import Integrated, IntegrationConfig, balance_scales, integrate
 from connrsfm_graph.problem import Problem, State
@@ -50,6 +51,12 @@ class SolveConfig:
     """Sigmas of the metric, intrinsic and extrinsic rows, and the robust threshold."""
     levenberg: Levenberg = Levenberg()
     """Settings of every minimisation."""
+
+    def __post_init__(self) -> None:
+        if self.outer_iterations < 1:
+            raise InputError(f"solve.outer_iterations is {self.outer_iterations}, expected at least 1")
+        if self.restarts < 0:
+            raise InputError(f"solve.restarts is {self.restarts}, expected 0 or more")
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from connrsfm_graph.errors import InputError
+from connrsfm_graph.image_graph import image_change
 from connrsfm_graph.tracks.tracks import Tracks
 
 MIN_FRAMES = 3
@@ -21,6 +22,8 @@ _SAME_PIXEL = 1e-6
 """Points closer than this, in pixels, are at the same place; finer than any tracker measures."""
 _THIN = 1e-4
 """Points whose spread across is less than this share of their spread along lie on a line."""
+_STILL = 1e-8
+"""Images of which less than this share of the layout changes do not differ (see `image_graph.image_change`)."""
 _COMPARISONS = 8
 """Other images each image's handedness is compared with."""
 
@@ -62,6 +65,7 @@ def check_reconstructable(tracks: Tracks, source: str = "tracks") -> tuple[Track
         )
     _refuse_lines(tracks, source)
     _refuse_mirrored(tracks, source)
+    _refuse_still(tracks, source)
     return tracks, (*coincident, *rare, *_odd_camera(tracks))
 
 
@@ -114,6 +118,17 @@ def _refuse_mirrored(tracks: Tracks, source: str) -> None:
         raise InputError(
             f"{source}: {_frames(mirrored)} shows the points mirrored against the other images; turn x (or y) around "
             "there, or leave it out"
+        )
+
+
+def _refuse_still(tracks: Tracks, source: str) -> None:
+    """Images that are shifted, turned or scaled copies of each other hold no information about the surface."""
+    order = np.arange(tracks.n_frames)
+    change = image_change(tracks.visible, tracks.pixels, np.stack([order, np.roll(order, 1)], axis=-1))
+    if change.max() < _STILL:
+        raise InputError(
+            f"{source}: the images differ by no more than a shift, a rotation and a scale, expected a surface that "
+            "moves or deforms in front of the camera"
         )
 
 

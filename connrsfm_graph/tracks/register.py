@@ -39,11 +39,11 @@ def register(
     d = _grid(side)
     at, affinity = at.astype(np.float64), affinity.copy()
     by_row, by_column = np.gradient(patch, axis=(1, 2))
-    gradient = np.stack([by_column, by_row], axis=-1).reshape(len(patch), -1, 2)
+    gradient = np.stack([by_column, by_row], axis=-1).reshape(len(patch), side * side, 2)
     J = np.concatenate(
         [gradient, (gradient[..., :, None] * d[None, :, None, :]).reshape(*gradient.shape[:2], 4)], axis=2
     )
-    first, size = _standardised(patch.reshape(len(patch), -1))
+    first, size = _standardised(patch.reshape(len(patch), side * side))
     J = J / np.maximum(size, 1e-6)[:, None, None]
     J -= J.mean(axis=1, keepdims=True)
     J -= first[..., None] * (first[:, None] @ J)

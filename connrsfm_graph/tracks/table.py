@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from pathlib import Path
 
 import numpy as np
@@ -63,8 +64,8 @@ def _rows(path: Path) -> tuple[np.ndarray, np.ndarray, list[int]]:
                     continue
                 try:
                     f, p, x, y = (row[column] for column in columns)
-                    ids.append((int(f), int(p)))
-                    pixels.append((float(x), float(y)))
+                    ids.append((_index(f), _index(p)))
+                    pixels.append((_pixel(x), _pixel(y)))
                 except (ValueError, IndexError):
                     raise InputError(
                         f"{path}: line {reader.line_num} is '{','.join(row)[:60]}', expected two whole numbers and "
@@ -76,3 +77,17 @@ def _rows(path: Path) -> tuple[np.ndarray, np.ndarray, list[int]]:
     if not ids:
         raise InputError(f"{path}: holds no observation below its first line")
     return np.array(ids, dtype=np.int64), np.array(pixels), lines
+
+
+def _index(text: str) -> int:
+    number = int(text)
+    if not -(2**63) <= number < 2**63:
+        raise ValueError(f"{number} is too large for an index")
+    return number
+
+
+def _pixel(text: str) -> float:
+    number = float(text)
+    if not math.isfinite(number):
+        raise ValueError(f"{number} is no coordinate; leave the line out where a point is not visible")
+    return number

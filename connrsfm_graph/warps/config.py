@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+import numpy as np
+
 from connrsfm_graph.errors import InputError
 
 Model = Literal["auto", "schwarzian", "bending", "gaussian_process"]
@@ -31,7 +33,7 @@ class WarpConfig:
     shortest_scale: float = 1.0
     """Shortest length scale of the Gaussian process, in units of the spread of the points. Finer detail counts as noise
     in a warp, whose second derivatives it would ruin."""
-    min_points: int = 8
+    min_points: int = 6
     """An edge with fewer shared points gets no warp."""
     robust: bool = True
     """Give less weight to points that the warp fitted to the others does not explain (wrong tracks)."""
@@ -51,7 +53,7 @@ class WarpConfig:
             raise InputError(f"warp probe_edges is {self.probe_edges}, expected at least 1")
         for name in ("schwarzian", "bending", "shortest_scale"):
             value = getattr(self, name)
-            if value is not None and not value > 0:
+            if value is not None and not 0 < value < np.inf:
                 raise InputError(f"warp {name} is {value}, expected a positive number")
-        if self.padding < 0:
+        if not 0 <= self.padding < np.inf:
             raise InputError(f"warp padding is {self.padding}, expected zero or more")

@@ -121,3 +121,11 @@ def test_pixels_that_do_not_fit_the_camera_are_told() -> None:
     assert "normalised coordinates" in warnings[0]
     _, warnings = check_reconstructable(Tracks.checked(views() * 30, K))
     assert "degrees off" in warnings[0]
+
+
+@pytest.mark.parametrize("shift", [0.0, 10.0])
+def test_images_that_do_not_differ_are_refused(shift: float) -> None:
+    frame = np.random.default_rng(0).uniform(100, 500, size=(30, 2))
+    pixels = frame + shift * np.arange(4)[:, None, None]
+    with pytest.raises(InputError, match="differ by no more than a shift"):
+        check_reconstructable(Tracks.checked(pixels, np.diag([500.0, 500.0, 1.0])))

@@ -150,7 +150,7 @@ def test_few_points_lines_and_random_pairs_are_reported():
     visible = all_visible(image)
     visible[1, 5:] = False
     warps = fit_warps(image, visible, np.array([[0, 1], [0, 2], [0, 3]]))
-    assert warps.reports[0].problem == "only 5 shared points, a warp needs 8"
+    assert warps.reports[0].problem == "only 5 shared points, a warp needs 6"
     assert warps.reports[1].problem == "the shared points lie on a line in the second image"
     assert not warps.reports[2].usable
     assert not warps.valid.any()
@@ -159,7 +159,7 @@ def test_few_points_lines_and_random_pairs_are_reported():
 
 
 def test_exactly_the_least_number_of_points_works():
-    image = smooth_images(8)
+    image = smooth_images(6)
     warps = fit_warps(image, all_visible(image), EDGES)
     assert warps.valid.all()
     assert np.abs(warps.jets.value[0] - image[1]).max() < 0.05
