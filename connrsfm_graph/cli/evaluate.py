@@ -57,7 +57,7 @@ def summary(evaluation: Evaluation) -> str:
     """The figures of the field in one line."""
     return (
         f"3D error {evaluation.e3d_percent:.3f} %, shape error {evaluation.shape_error_deg:.2f} degrees, "
-        f"3D RMSE {evaluation.rmse_3d:.4g}, coverage {100 * evaluation.coverage:.1f} %"
+        f"3D RMSE {evaluation.rmse_3d_percent:.3f} % of the extent, coverage {100 * evaluation.coverage:.1f} %"
     )
 
 

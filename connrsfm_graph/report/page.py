@@ -104,7 +104,7 @@ def _header(reconstruction: Reconstruction, record: RunRecord, evaluation: Evalu
     shown = "".join(
         f"<div><dt>{name}</dt><dd>{value} <small>{unit}</small></dd></div>" for name, value, unit in figures
     )
-    memory = f", {record.peak_memory_mib:.0f} MiB" if record.peak_memory_mib else ""
+    memory = f", peak memory {record.peak_memory_mib:.0f} MiB" if record.peak_memory_mib else ""
     return (
         f"<header><h1>{html.escape(Path(record.source).name)}</h1>"
         f"<p>Surface of every image from 2D tracks. Method <code>{html.escape(record.method)}</code>, "
