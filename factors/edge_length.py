@@ -8,7 +8,7 @@ X = exp(b) (x + q, 1) with log depth b, tracked image point x and ray correction
 with e the log length of the edge, shared by all views. Without the log conformal factors f it says that views are
 isometric; with them it is discrete conformal equivalence (Springborn, Schroeder and Pinkall 2008), which Moebius
 maps fulfil exactly, chord by chord. The offset a turns the chord into an arc: over a surface curve that leaves the
-chord with slopes s_i and s_k it is `arc_offset`, and zero where the chord itself is meant.
+chord at known angles it is `arc_offset`, and zero where the chord itself is meant.
 """
 
 from __future__ import annotations
@@ -46,13 +46,13 @@ def log_chord_kernel(xi, yi, zi, xk, yk, zk):
 
 
 @njit(cache=True, inline="always")
-def arc_offset(slope_i, slope_k):
-    """Log ratio of arc to chord of the cubic that leaves the chord with these slopes at its two ends.
+def arc_offset(angle_i, angle_k):
+    """Log ratio of arc to chord of a smooth curve that rises from the chord at these angles at its two ends.
 
-    To second order in the slopes: the mean of y'^2 / 2 over the chord. For a circle of radius R (slopes of opposite
-    sign) it is the familiar length^2 / (24 R^2).
+    To second order it is the mean of y'^2 / 2 of the cubic with these end slopes; both angles are measured in the same
+    direction along the chord. For a circle (opposite angles a) it is a^2 / 6, that is length^2 / (24 R^2).
     """
-    return (2.0 * slope_i * slope_i + 2.0 * slope_k * slope_k - slope_i * slope_k) / 30.0
+    return (2.0 * angle_i * angle_i + 2.0 * angle_k * angle_k - angle_i * angle_k) / 30.0
 
 
 @njit(cache=True)

@@ -53,7 +53,7 @@ def resolve(shape: Shape, image: np.ndarray, mesh: Mesh, declared: np.ndarray) -
         shape: conformal shape.
         image: (F, P, 2) tracked image points.
         mesh: the mesh.
-        declared: (F,) bool, views declared isometric to each other; the fit has already used it, so they are right.
+        declared: (F,) bool, views declared isometric to each other.
     """
     flip, isometric = isometric_views(shape, image, declared)
     shape = inverted(shape, image, flip)
@@ -82,19 +82,30 @@ def isometric_views(shape: Shape, image: np.ndarray, declared: np.ndarray) -> tu
     F = len(shape.log_factor)
     other = inverted(shape, image, np.ones(F, dtype=bool)).log_factor
     factor = np.stack([shape.log_factor, other], axis=1)
+    spread = np.array([[_spreads(factor[a], factor[b]) for b in range(F)] for a in range(F)])
     flip, decided = np.zeros(F, dtype=bool), declared.copy()
+    if declared.any():
+        first = int(declared.argmax())
+        options = spread[first][declared]  # (N, 2, 2): inversion of the first view, inversion of each
+        own = int(options.min(axis=2).sum(axis=0).argmin())
+        flip[declared] = options[:, own].argmin(axis=1)
+        flip[first] = own
     pairs = []
     for a in range(F):
         for b in range(a):
-            spread = np.array([[(factor[a, s] - factor[b, t]).std() for t in (0, 1)] for s in (0, 1)])
-            least, second = np.sort(spread.ravel())[:2]
+            least, second = np.sort(spread[a, b].ravel())[:2]
             if least < _ISOMETRIC and second > _MARGIN * least:
-                pairs.append((float(least), a, b, *divmod(int(spread.argmin()), 2)))
+                pairs.append((float(least), a, b, *divmod(int(spread[a, b].argmin()), 2)))
     for _, a, b, *wanted_inverse in sorted(pairs):
         for view, wanted in zip((a, b), wanted_inverse, strict=True):
             if not decided[view]:
                 flip[view], decided[view] = bool(wanted), True
     return flip, decided
+
+
+def _spreads(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(2, 2) standard deviations of the difference of two views' factors, each (2, P): as they are and inverted."""
+    return np.asarray((a[:, None] - b[None]).std(axis=-1))
 
 
 def shear_correlation(points: np.ndarray, mesh: Mesh) -> np.ndarray:

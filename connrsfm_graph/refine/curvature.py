@@ -109,10 +109,9 @@ def _arc_offsets(X, triangles, edges, offset):
         size = np.sqrt(dx * dx + dy * dy + dz * dz)
         offset[e] = 0.0
         if size > 0.0:
-            offset[e] = arc_offset(
-                (normal[i, 0] * dx + normal[i, 1] * dy + normal[i, 2] * dz) / size,
-                (normal[k, 0] * dx + normal[k, 1] * dy + normal[k, 2] * dz) / size,
-            )
+            rise_i = (normal[i, 0] * dx + normal[i, 1] * dy + normal[i, 2] * dz) / size
+            rise_k = (normal[k, 0] * dx + normal[k, 1] * dy + normal[k, 2] * dz) / size
+            offset[e] = arc_offset(np.arcsin(min(max(rise_i, -1.0), 1.0)), np.arcsin(min(max(rise_k, -1.0), 1.0)))
 
 
 @njit(cache=True, nogil=True)

@@ -68,15 +68,15 @@ class Task:
         image = self.completed.image
         return float(np.median(np.linalg.norm(image[:, near[:, 0]] - image[:, near[:, 1]], axis=-1)))
 
-    def measurements(self, noise: Noise) -> Measurements:
-        """Measurements under given noise levels."""
+    def measurements(self, noise: Noise, declared: bool = True) -> Measurements:
+        """Measurements under given noise levels, with or without what is known of views declared isometric."""
         config = self.config
         return Measurements(
             image=self.completed.image,
             image_weight=noise.image_weight(self.seen, self.completed.deviation),
             log_depth=start_shape(self.completed, self.mesh).log_depth,
             length_weight=np.full((len(self.seen), len(self.mesh.edges)), 1.0 / noise.length),
-            factor_weight=np.where(self.declared, _DECLARED_FACTOR, _FACTOR),
+            factor_weight=np.where(self.declared & declared, _DECLARED_FACTOR, _FACTOR),
             mesh=self.mesh,
             weights=Weights(
                 huber=noise.huber,
@@ -159,8 +159,11 @@ def fit_isometric(task: Task, noise: Noise) -> Fit:
 
 
 def fit_conformal(task: Task, noise: Noise) -> Fit:
-    """Conformal fit from the start: all views restarted until none gains, then inversions resolved."""
-    measurements = task.measurements(noise)
+    """Conformal fit from the start: all views restarted until none gains, then inversions resolved.
+
+    Views declared isometric are held to it only in the end: on the way it would keep wrong shapes from turning right.
+    """
+    measurements = task.measurements(noise, declared=False)
     shape, history = _minimise(task, measurements, start_shape(task.completed, task.mesh, conformal=True))
     for _ in range(_RESTARTS):
         shape, renewed = restart(measurements, shape)
@@ -169,6 +172,7 @@ def fit_conformal(task: Task, noise: Noise) -> Fit:
         shape, more = _minimise(task, measurements, shape)
         history += more
     shape, ambiguity = resolve(shape, measurements.image, task.mesh, task.declared)
+    measurements = task.measurements(noise)
     shape, more = _minimise(task, measurements, shape)
     history += more
     alternative = None

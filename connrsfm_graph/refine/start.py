@@ -27,6 +27,8 @@ def start_mesh(completed: Completed, visible: np.ndarray, rings: int) -> Mesh:
     points = PERSPECTIVE.points(completed.image, np.exp(completed.log_depth))
 
     def latent(edges: np.ndarray) -> np.ndarray:
+        if len(edges) == 0:
+            return np.empty(0)
         chords = log_chords(points, edges)
         return np.median(chords - np.median(chords, axis=1, keepdims=True), axis=0)
 

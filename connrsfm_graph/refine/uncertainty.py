@@ -36,7 +36,6 @@ def log_depth_deviation(measurements: Measurements, shape: Shape, stretch: bool,
     envelope = measurements.envelope(shape.log_factor.size > 0)
     equations, _ = linearise(measurements, shape, lag(measurements, shape), envelope)
     factorised = Factorised(equations, envelope, measurements.mesh.edges)
-    size = len(envelope.first) // P
     rays = envelope.unknown[:, None] + np.array([1, 2])
     edges = measurements.mesh.edges
     variance = np.zeros((F, P))

@@ -61,6 +61,9 @@ def make_template(image: np.ndarray, visible: np.ndarray) -> tuple[np.ndarray, n
     base = int(visible.sum(axis=1).argmax())
     template, known = np.where(visible[base, :, None], image[base], 0.0), visible[base].copy()
     deviation = np.zeros(len(template))
+    unseen = np.flatnonzero(~visible.any(axis=0))
+    if len(unseen):
+        raise InputError(f"refinement: point {unseen[0]} is seen in no image, expected points seen at least once")
     while not known.all():
         shared = (visible & known).sum(axis=1)
         view = int(np.where((visible & ~known).any(axis=1), shared, -1).argmax())

@@ -1,0 +1,135 @@
+"""The batched solver takes the step that GTSAM takes on the same factors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from connrsfm_graph.errors import ComputationError
+from connrsfm_graph.refine.cost import Weights
+from connrsfm_graph.refine.elimination import Factorised
+from connrsfm_graph.refine.mesh import surface_mesh
+from connrsfm_graph.refine.solve import Measurements, Shape, costs, lag, linearise, moved
+from factors.adapter import make_factor
+from factors.bending import Bending
+from factors.edge_length import edge_length_factor
+from factors.image_point import image_point_factor
+from factors.keys import LOG_DEPTH, LOG_FACTOR, LOG_LENGTH, RAY_CORRECTION, key
+from factors.scale_smoothness import scale_smoothness_factor
+
+F, P = 3, 9
+
+
+def _random_problem(conformal: bool, bending: bool, seed: int = 0) -> tuple[Measurements, Shape]:
+    rng = np.random.default_rng(seed)
+    image = rng.uniform(-0.5, 0.5, (1, P, 2)) + rng.normal(0, 0.05, (F, P, 2))
+    mesh = surface_mesh(image[0], lambda edges: np.zeros(len(edges)))
+    E = len(mesh.edges)
+    shape = Shape(
+        rng.normal(0.5, 0.1, (F, P)),
+        rng.normal(0, 0.01, (F, P, 2)),
+        rng.normal(0, 0.1, (F, P if conformal else 0)),
+        rng.normal(-0.7, 0.3, E),
+    )
+    measurements = Measurements(
+        image=image,
+        image_weight=rng.uniform(50, 100, (F, P)),
+        log_depth=shape.log_depth - rng.normal(0, 0.1, (F, P)),
+        length_weight=rng.uniform(5, 10, (F, E)),
+        factor_weight=rng.uniform(0.1, 1, F),
+        mesh=mesh,
+        weights=Weights(huber=1.0, bending=0.5 * bending, smoothness=5.0, drift=1.0, unit=0.0),
+    )
+    return measurements, shape
+
+
+def _graph(measurements: Measurements, shape: Shape) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    mesh, weights, lagged = measurements.mesh, measurements.weights, lag(measurements, shape)
+    conformal = shape.log_factor.size > 0
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+
+    def sigma(dimension: int, weight: float) -> gtsam.noiseModel.Isotropic:
+        return gtsam.noiseModel.Isotropic.Sigma(dimension, 1.0 / weight)
+
+    loss = gtsam.noiseModel.mEstimator.Huber.Create(weights.huber)
+    for e, log_length in enumerate(shape.log_length):
+        values.insert(key(LOG_LENGTH, e), np.array([log_length]))
+    for j in range(F):
+        image = measurements.image[j]
+        for i in range(P):
+            values.insert(key(LOG_DEPTH, i, j), shape.log_depth[j, i : i + 1])
+            values.insert(key(RAY_CORRECTION, i, j), shape.correction[j, i])
+            graph.add(image_point_factor(i, j, sigma(2, measurements.image_weight[j, i])))
+            prior = measurements.log_depth[j, i : i + 1]
+            graph.add(gtsam.PriorFactorVector(key(LOG_DEPTH, i, j), prior, sigma(1, weights.drift)))
+            if conformal:
+                values.insert(key(LOG_FACTOR, i, j), shape.log_factor[j, i : i + 1])
+                weight = measurements.factor_weight[j]
+                graph.add(gtsam.PriorFactorVector(key(LOG_FACTOR, i, j), np.zeros(1), sigma(1, weight)))
+        for e, (i, k) in enumerate(mesh.edges):
+            noise = gtsam.noiseModel.Robust.Create(loss, sigma(1, measurements.length_weight[j, e]))
+            offset = lagged.offset[j, e]
+            graph.add(edge_length_factor(e, i, k, j, image[i], image[k], noise, offset, conformal))
+            if conformal and e < mesh.n_near:
+                graph.add(scale_smoothness_factor(i, k, j, sigma(1, weights.smoothness)))
+        if weights.bending > 0:
+            for hinge, stencil in zip(mesh.hinges, lagged.stencils, strict=True):
+                keys = [k for i in hinge for k in (key(LOG_DEPTH, i, j), key(RAY_CORRECTION, i, j))]
+                graph.add(make_factor(Bending(stencil, image[hinge]), keys, [1, 2] * 4, sigma(3, weights.bending)))
+    return graph, values
+
+
+@pytest.mark.parametrize("conformal", [False, True])
+@pytest.mark.parametrize("bending", [False, True])
+def test_cost_and_step_equal_gtsams(conformal, bending):
+    measurements, shape = _random_problem(conformal, bending)
+    graph, values = _graph(measurements, shape)
+    lagged = lag(measurements, shape)
+    assert costs(measurements, shape, lagged).sum() == pytest.approx(graph.error(values), rel=1e-12)
+    envelope = measurements.envelope(conformal)
+    equations, _ = linearise(measurements, shape, lagged, envelope)
+    step = Factorised(equations, envelope, measurements.mesh.edges).step(tolerance=1e-13)
+    ours = moved(shape, envelope, *step)
+    theirs = values.retract(graph.linearize(values).optimize())
+    for j in range(F):
+        for i in range(P):
+            assert ours.log_depth[j, i] == pytest.approx(theirs.atVector(key(LOG_DEPTH, i, j))[0], abs=1e-10)
+            assert ours.correction[j, i] == pytest.approx(theirs.atVector(key(RAY_CORRECTION, i, j)), abs=1e-10)
+            if conformal:
+                assert ours.log_factor[j, i] == pytest.approx(theirs.atVector(key(LOG_FACTOR, i, j))[0], abs=1e-10)
+    for e in range(len(shape.log_length)):
+        assert ours.log_length[e] == pytest.approx(theirs.atVector(key(LOG_LENGTH, e))[0], abs=1e-10)
+
+
+def test_the_schur_complement_is_symmetric_and_positive_definite():
+    measurements, shape = _random_problem(conformal=True, bending=True, seed=1)
+    measurements = replace(measurements, weights=measurements.weights._replace(unit=10.0))
+    envelope = measurements.envelope(True)
+    equations, _ = linearise(measurements, shape, lag(measurements, shape), envelope)
+    factorised = Factorised(equations, envelope, measurements.mesh.edges, damping=0.1)
+    S = np.stack([factorised.schur_product(v) for v in np.eye(len(measurements.mesh.edges))])
+    assert pytest.approx(S.T, abs=1e-9 * np.abs(S).max()) == S
+    assert np.linalg.eigvalsh(S).min() > 0
+
+
+def test_views_damped_each_on_their_own_take_shorter_steps():
+    measurements, shape = _random_problem(conformal=False, bending=False, seed=2)
+    envelope = measurements.envelope(False)
+    equations, _ = linearise(measurements, shape, lag(measurements, shape), envelope)
+    edges = measurements.mesh.edges
+    free = Factorised(equations, envelope, edges).solve_views(equations.gradient)
+    damped = Factorised(equations, envelope, edges, np.array([0.0, 10.0, 0.0])).solve_views(equations.gradient)
+    assert damped[[0, 2]] == pytest.approx(free[[0, 2]], rel=1e-12)
+    assert np.linalg.norm(damped[1]) < 0.5 * np.linalg.norm(free[1])
+
+
+def test_a_matrix_that_is_not_positive_definite_is_named():
+    measurements, shape = _random_problem(conformal=False, bending=False)
+    envelope = measurements.envelope(False)
+    equations, _ = linearise(measurements, shape, lag(measurements, shape), envelope)
+    equations.matrix[1] *= -1.0
+    with pytest.raises(ComputationError, match="normal equations of a view are not positive definite"):
+        Factorised(equations, envelope, measurements.mesh.edges)
