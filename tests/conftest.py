@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
+
+# Small matrices gain nothing from threads of BLAS; set before numpy is loaded.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # Time limits per example say more about the machine than about the code; compiled kernels make the first one slow.
 settings.register_profile("untimed", deadline=None)
