@@ -1,0 +1,54 @@
+"""Noise levels and stated uncertainties on simulated data."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from connrsfm_graph.refine import RefineConfig, refine
+from connrsfm_graph.refine.mesh import surface_mesh
+from connrsfm_graph.refine.noise import neighbour_correlation
+from connrsfm_graph.synthetic import isometric_bending, spheres, with_noise
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_depth_errors_are_as_large_as_stated(seed):
+    scene = isometric_bending(n_frames=8, n_points=100, seed=seed)
+    tracks = with_noise(scene.tracks, 1.0, seed=seed)
+    sigma = 1.0 / tracks.focal_length()
+    found = refine(tracks.normalised(), tracks.visible, scene.log_depth, RefineConfig(), sigma)
+    error = found.log_depth - scene.log_depth
+    normalised = (error - np.median(error)) / (found.depth_std / np.exp(found.log_depth))
+    # Errors of neighbours are alike: of the 800 depths some tens are independent.
+    assert 0.4 < (normalised**2).mean() < 1.8
+    assert 0.87 < (np.abs(normalised) < 1.96).mean() < 0.995
+
+
+def test_noise_is_recognised_and_lengths_are_trusted_more():
+    scene = spheres(n_frames=6, n_points=80)
+    tracks = with_noise(scene.tracks, 2.0)
+    sigma = 2.0 / tracks.focal_length()
+    found = refine(tracks.normalised(), tracks.visible, scene.log_depth, RefineConfig(), sigma)
+    assert found.evidence["image noise"] == pytest.approx(sigma)
+    assert found.evidence["length noise"] < RefineConfig().length_sigma
+
+
+def test_corrections_that_neighbours_share_are_no_noise():
+    rng = np.random.default_rng(0)
+    position = rng.uniform(size=(150, 2))
+    mesh = surface_mesh(position, lambda pairs: np.zeros(len(pairs)))
+    seen = np.ones((6, 150), dtype=bool)
+    correlation, error = neighbour_correlation(rng.normal(size=(6, 150, 2)), seen, mesh)
+    assert abs(correlation) < 4 * error
+    smooth = np.repeat(np.sin(6 * position)[None], 6, axis=0)
+    assert neighbour_correlation(smooth, seen, mesh)[0] > 0.3
+
+
+def test_the_same_input_gives_the_same_result():
+    scene = isometric_bending(n_frames=4, n_points=40)
+    tracks = with_noise(scene.tracks, 1.0)
+    first, second = (
+        refine(tracks.normalised(), tracks.visible, scene.log_depth, RefineConfig(), 2e-3) for _ in range(2)
+    )
+    assert (first.points == second.points).all()
+    assert (first.depth_std == second.depth_std).all()
