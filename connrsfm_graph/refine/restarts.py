@@ -14,6 +14,8 @@ from connrsfm_graph.refine.solve import Measurements, Shape, costs, fit_views, l
 from connrsfm_graph.refine.start import log_chords
 
 _ITERATIONS = 25
+_TOLERANCE = 0.02
+"""A view's fit from a new surface ends where an iteration gains less than this part."""
 _BETTER = 0.9
 """A new surface must lower the view's cost to this part."""
 _TILTS = 6
@@ -47,7 +49,7 @@ def restart(measurements: Measurements, shape: Shape) -> tuple[Shape, np.ndarray
     least = costs(measurements, shape, lag(measurements, shape))
     best, renewed = shape, np.zeros(len(least), dtype=bool)
     for start in _starts(measurements, shape):
-        trial, cost = fit_views(measurements, _scaled(measurements, start), _ITERATIONS)
+        trial, cost = fit_views(measurements, _scaled(measurements, start), _ITERATIONS, _TOLERANCE)
         better = cost < _BETTER * least
         best, least, renewed = best.with_views(better, trial), np.where(better, cost, least), renewed | better
     return best, renewed

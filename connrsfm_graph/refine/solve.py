@@ -221,21 +221,30 @@ def minimise(measurements: Measurements, shape: Shape, iterations: int, toleranc
     return shape, history
 
 
-def fit_views(measurements: Measurements, shape: Shape, iterations: int) -> tuple[Shape, np.ndarray]:
-    """Each view on its own, lengths held: the shape and the (F,) costs. Views are damped independently."""
+def fit_views(measurements: Measurements, shape: Shape, iterations: int, tolerance: float) -> tuple[Shape, np.ndarray]:
+    """Each view on its own, lengths held, until an iteration lowers its cost by less than `tolerance` of it.
+
+    Returns:
+        The shape and the (F,) costs.
+    """
     envelope = measurements.envelope(shape.log_factor.size > 0)
     damping = np.full(len(shape.log_depth), _DAMPING[0])
-    lagged = lag(measurements, shape)
+    active = np.arange(len(damping))
     for _ in range(iterations):
-        before = costs(measurements, shape, lagged)
-        equations, _ = linearise(measurements, shape, lagged, envelope)
-        factorised = Factorised(equations, envelope, measurements.mesh.edges, damping)
-        trial = moved(shape, envelope, -factorised.solve_views(equations.gradient), 0.0)
-        better = costs(measurements, trial, lagged) <= before
-        shape = shape.with_views(better, trial)
-        damping = np.clip(np.where(better, damping / 10.0, damping * 10.0), _DAMPING[1], _DAMPING[2])
-        lagged = lag(measurements, shape)
-    return shape, costs(measurements, shape, lagged)
+        part, start = measurements.views(active), shape.views(active)
+        lagged = lag(part, start)
+        before = costs(part, start, lagged)
+        equations, _ = linearise(part, start, lagged, envelope)
+        factorised = Factorised(equations, envelope, measurements.mesh.edges, damping[active])
+        trial = moved(start, envelope, -factorised.solve_views(equations.gradient), 0.0)
+        after = costs(part, trial, lagged)
+        better = after <= before
+        shape = shape.replaced(active, start.with_views(better, trial))
+        damping[active] = np.clip(damping[active] * np.where(better, 0.1, 10.0), _DAMPING[1], _DAMPING[2])
+        active = active[~better | (before - after > tolerance * before)]
+        if len(active) == 0:
+            break
+    return shape, costs(measurements, shape, lag(measurements, shape))
 
 
 def _total(measurements: Measurements, shape: Shape, lagged: Lagged) -> float:
