@@ -12,10 +12,10 @@ import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
-from connrsfm_graph.cli import demo, evaluate, reconstruct, report, settings, slam, track
+from connrsfm_graph.cli import demo, densify, evaluate, reconstruct, report, settings, slam, track
 from connrsfm_graph.errors import ComputationError, InputError
 
-COMMANDS = (demo, track, reconstruct, slam, evaluate, report, settings)
+COMMANDS = (demo, track, reconstruct, slam, densify, evaluate, report, settings)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -1,0 +1,200 @@
+"""Dense textured surfaces of all images of a reconstruction, written into a folder (see `dense.layout`)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from connrsfm_graph.dense.layout import DENSE_FOLDER, SEQUENCE_FILE, DenseFrame, DenseIndex
+from connrsfm_graph.dense.region import surface_region
+from connrsfm_graph.dense.sparse import SparsePoints
+from connrsfm_graph.dense.spline import SplineDepth
+from connrsfm_graph.errors import InputError
+from connrsfm_graph.export.depth_png import png_scale, write_depth_png
+from connrsfm_graph.export.glb import jpeg_of, write_glb, write_glb_sequence
+from connrsfm_graph.export.mesh import TexturedMesh, default_step, mesh_of_depth
+from connrsfm_graph.export.ply import write_ply
+from connrsfm_graph.files import folder_written_beside
+from connrsfm_graph.reconstruction import Reconstruction
+from connrsfm_graph.tracks.images import ImageSequence, Source
+
+FEWEST_POINTS = 10
+"""Images with fewer sparse points have no dense surface."""
+SEQUENCE_CELLS = 80
+"""Cells along the longer side of a surface of the animation."""
+SEQUENCE_TEXTURE = 512
+"""Longest side of an image of the animation."""
+SECONDS_PER_IMAGE = 0.2
+"""For how long the animation shows each image."""
+_CENTRE = (0.3, 0.7)
+
+
+class DepthMethod(Protocol):
+    """A way from sparse points to a depth map."""
+
+    name: str
+
+    def depth(self, points: SparsePoints, size: tuple[int, int]) -> np.ndarray:
+        """(H, W) depth of every pixel of an image of `size` (W, H)."""
+        ...
+
+
+def densify(
+    reconstruction: Reconstruction,
+    images: Source,
+    out: str | Path,
+    progress: Callable[[int, int], None] | None = None,
+) -> DenseIndex:
+    """Make the dense surface of every image and write OUT/dense.
+
+    Args:
+        reconstruction: sparse surfaces.
+        images: the images that were tracked, as a folder, a list of files or a video; more may be there where the
+            reconstruction knows their names.
+        out: folder of the result.
+        progress: called with (images done, images).
+
+    Raises:
+        InputError: images that are not those of the tracks, cannot be read or are of different sizes, or no image with
+            enough points.
+    """
+    sparse = [SparsePoints.of(reconstruction, f) for f in range(reconstruction.n_frames)]
+    usable = [points for points in sparse if len(points) >= FEWEST_POINTS]
+    if not usable:
+        most = max(map(len, sparse))
+        raise InputError(f"no image has {FEWEST_POINTS} recovered points (the most are {most}), too few for a surface")
+    scale = png_scale(1.5 * max(float(points.depth.max()) for points in usable))
+    method, reason = SplineDepth(usable), "asked for"
+    frames: list[DenseFrame] = []
+    skipped, warnings = [], []
+    coarse: list[tuple[TexturedMesh, bytes, str]] = []
+    size = (0, 0)
+    with folder_written_beside(out) as part:
+        folder = part / DENSE_FOLDER
+        folder.mkdir()
+        for f, image in enumerate(_images_of(reconstruction, images)):
+            points, name = sparse[f], reconstruction.frame_name(f)
+            if f == 0:
+                size = image.shape[1], image.shape[0]
+                warnings += _camera_warnings(points.K, size)
+            _check_inside(reconstruction, f, size, images)
+            if len(points) < FEWEST_POINTS:
+                reason_skipped = f"{len(points)} recovered points, a surface needs {FEWEST_POINTS}"
+                skipped.append({"frame": f, "name": name, "reason": reason_skipped})
+                continue
+            start = time.perf_counter()
+            depth = np.where(surface_region(points.pixels, size), method.depth(points, size), np.nan)
+            mesh = mesh_of_depth(depth, points.K)
+            if not len(mesh.triangles):
+                skipped.append({"frame": f, "name": name, "reason": "its points span no surface"})
+                continue
+            files = _write_frame(folder, f, name, depth, mesh, image, scale)
+            frames.append(
+                DenseFrame(
+                    frame=f,
+                    name=name,
+                    K=points.K.tolist(),
+                    points=len(points),
+                    covered=float(np.isfinite(depth).mean()),
+                    depth_range=[float(np.nanmin(depth)), float(np.nanmax(depth))],
+                    residual_percent=100.0 * _residual(depth, points),
+                    seconds=time.perf_counter() - start,
+                    **files,
+                )
+            )
+            coarse_mesh = mesh_of_depth(depth, points.K, default_step(depth, SEQUENCE_CELLS))
+            coarse.append((coarse_mesh, jpeg_of(image, SEQUENCE_TEXTURE), name))
+            if progress is not None:
+                progress(f + 1, reconstruction.n_frames)
+        if not frames:
+            raise InputError("the points of no image span a surface, so that there is nothing to make dense")
+        meshes, jpegs, names = zip(*coarse, strict=True)
+        write_glb_sequence(folder / SEQUENCE_FILE, meshes, jpegs, names, SECONDS_PER_IMAGE)
+        index = DenseIndex(
+            method=method.name,
+            reason=reason,
+            checkpoint=None,
+            size=list(size),
+            depth_png_scale=scale,
+            sequence=SEQUENCE_FILE,
+            frames=frames,
+            skipped=skipped,
+            warnings=warnings,
+        )
+        index.save(folder)
+    return index
+
+
+def _write_frame(
+    folder: Path, f: int, name: str, depth: np.ndarray, mesh: TexturedMesh, image: np.ndarray, scale: float
+) -> dict[str, str]:
+    """Write the files of one image; their names by kind."""
+    files = {
+        "depth": f"depth/{f:03d}.npy",
+        "depth_png": f"depth/{f:03d}.png",
+        "texture": f"texture/{f:03d}.jpg",
+        "glb": f"glb/{f:03d}.glb",
+        "ply": f"ply/{f:03d}.ply",
+    }
+    for file in files.values():
+        (folder / file).parent.mkdir(exist_ok=True)
+    jpeg = jpeg_of(image)
+    np.save(folder / files["depth"], depth.astype(np.float32))
+    write_depth_png(folder / files["depth_png"], depth, scale)
+    (folder / files["texture"]).write_bytes(jpeg)
+    write_glb(folder / files["glb"], mesh, jpeg, name)
+    write_ply(folder / files["ply"], mesh, image)
+    return files
+
+
+def _images_of(reconstruction: Reconstruction, source: Source) -> Iterator[np.ndarray]:
+    """The image of every frame in order; where there are more images than frames, those with the frames' names.
+
+    Raises:
+        InputError: the images are not as many as the frames, nor are the frames' names among them.
+    """
+    sequence, names, wanted = ImageSequence(source), reconstruction.image_names, reconstruction.n_frames
+    by_name = names is not None and len(sequence) != wanted
+    found = 0
+    for name, image in sequence:
+        if by_name and (found == wanted or name != reconstruction.frame_name(found)):
+            continue
+        found += 1
+        if found <= wanted:
+            yield image
+    if found != wanted:
+        sought = f"{wanted} images named as in the result" if by_name else f"{wanted} images"
+        raise InputError(f"{source}: holds {found}, expected {sought}, one per frame")
+
+
+def _check_inside(reconstruction: Reconstruction, f: int, size: tuple[int, int], source: Source) -> None:
+    """Raise `InputError` where tracks lie outside of an image of `size`."""
+    seen = reconstruction.pixels[f, reconstruction.visible[f]]
+    if len(seen) and ((seen < -0.5) | (seen > np.array(size) - 0.5)).any():
+        x, y = seen.max(axis=0)
+        raise InputError(
+            f"{source}: images have {size[0]} x {size[1]} pixels but tracks of {reconstruction.frame_name(f)} reach "
+            f"x = {x:.0f}, y = {y:.0f}; expected the images that were tracked, at their size"
+        )
+
+
+def _camera_warnings(K: np.ndarray, size: tuple[int, int]) -> list[str]:
+    """A sentence where the camera's axis is so far from the middle that the images may be larger than those tracked."""
+    middle = K[:2, 2] / np.array(size)
+    if ((middle > _CENTRE[0]) & (middle < _CENTRE[1])).all():
+        return []
+    return [
+        f"the camera's axis meets the image at {middle[0]:.0%} of its width and {middle[1]:.0%} of its height: check "
+        "that the images have the size that was tracked"
+    ]
+
+
+def _residual(depth: np.ndarray, points: SparsePoints) -> float:
+    """Root mean square relative difference of a depth map to the sparse points, at the nearest pixels."""
+    x, y = np.round(points.pixels).astype(int).clip(0, np.array(depth.shape[::-1]) - 1).T
+    relative = depth[y, x] / points.depth - 1.0
+    return float(np.sqrt(np.nanmean(relative**2)))
