@@ -51,7 +51,7 @@ def test_the_command_line_knows_every_experiment(capsys: pytest.CaptureFixture[s
     with pytest.raises(SystemExit) as stop:
         main(["no_such_experiment"])
     assert stop.value.code == 2
-    assert {experiment.name for experiment in TABLES} | {"theorem", "summary"} == set(EXPERIMENTS)
+    assert {experiment.name for experiment in TABLES} | {"theorem", "accuracy", "summary"} == set(EXPERIMENTS)
 
 
 def test_a_named_experiment_writes_into_the_folder(tmp_path: Path) -> None:
