@@ -24,7 +24,7 @@ def run(arguments: argparse.Namespace) -> None:
     from connrsfm_graph.progress import Progress
     from connrsfm_graph.synthetic.rendered import render_sequence
     from connrsfm_graph.tracks import save_tracks
-    from connrsfm_graph.tracks.follow import track_images
+    from connrsfm_graph.tracks.front_end import images_to_tracks
 
     out = check_output_folder(arguments.out)
     config = resolved(arguments)
@@ -38,6 +38,7 @@ def run(arguments: argparse.Namespace) -> None:
         for file, image in zip(files, sequence.images, strict=True):
             cv2.imwrite(str(file), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
         with progress.stage("track"):
-            tracks = sequence.truth_for(track_images(files, sequence.K, progress=progress.update))
+            tracked = images_to_tracks(files, sequence.K, progress=progress.update)
+        tracks = sequence.truth_for(tracked.tracks)
         save_tracks(part / TRACKS_FILE, tracks)
     reconstruct_into(out, tracks, str(out / TRACKS_FILE), config, progress, images=list(sequence.images))

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import re
+import tempfile
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
 
@@ -14,6 +17,8 @@ from connrsfm_graph.errors import InputError
 from connrsfm_graph.files import require_file
 
 _ENDINGS = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm"}
+_DAMAGED = re.compile(rb"premature end|bad Huffman|\d\d extraneous bytes", re.IGNORECASE)
+"""What the decoder of JPEG says where it fills in what it cannot read; a few extraneous bytes are a camera's habit."""
 Source = str | Path | Sequence[str | Path]
 
 
@@ -23,8 +28,9 @@ class ImageSequence:
     Nothing is held in memory, so an iteration reads the files again.
     """
 
-    def __init__(self, source: Source, every: int = 1) -> None:
-        """Take every `every`-th image of a folder (by name, numbers in numerical order), of a list of files or a video.
+    def __init__(self, source: Source, every: int = 1, first: int = 0, last: int | None = None) -> None:
+        """Take every `every`-th image from number `first` to `last` (both included, counted from 0; to the end where
+        None) of a folder (by name, numbers in numerical order), of a list of files or of a video.
 
         Raises:
             InputError: no such folder or file, or a folder without images. What is wrong with one image (unreadable, of
@@ -32,7 +38,9 @@ class ImageSequence:
         """
         if every < 1:
             raise InputError(f"every {every}-th image asked for, expected 1 or more")
-        self.every = every
+        if first < 0 or (last is not None and last < first):
+            raise InputError(f"images {first} to {last} asked for, expected two numbers from 0 in ascending order")
+        self._chosen = slice(first, None if last is None else last + 1, every)
         self._video: Path | None = None
         if isinstance(source, str | Path):
             path = Path(source)
@@ -52,16 +60,21 @@ class ImageSequence:
 
     def __len__(self) -> int:
         """Number of images; for a video what its header says, which may be off by some."""
+        return len(self.names())
+
+    def names(self) -> list[str]:
+        """Names of all images, as they come with them; for a video as many as its header says."""
         if self._video is None:
-            return len(range(0, len(self._files), self.every))
-        capture = cv2.VideoCapture(str(self._video))
+            return [file.name for file in self._files[self._chosen]]
+        with _decoders_messages():
+            capture = cv2.VideoCapture(str(self._video))
         declared = max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
         capture.release()
-        return len(range(0, declared, self.every))
+        return [_frame_name(self._video, number) for number in range(declared)[self._chosen]]
 
     def __iter__(self) -> Iterator[tuple[str, np.ndarray]]:
         first: tuple[str, tuple[int, ...]] | None = None
-        for name, image in islice(self._all(), 0, None, self.every):
+        for name, image in self._read():
             if first is None:
                 first = name, image.shape
             elif image.shape != first[1]:
@@ -72,38 +85,106 @@ class ImageSequence:
                 )
             yield name, image
 
-    def _all(self) -> Iterator[tuple[str, np.ndarray]]:
+    def _read(self) -> Iterator[tuple[str, np.ndarray]]:
         if self._video is None:
-            for file in self._files:
+            for file in self._files[self._chosen]:
                 yield file.name, read_image(file)
             return
-        capture = cv2.VideoCapture(str(self._video))
-        try:
-            number = 0
-            while True:
+        frames = enumerate(_video_frames(self._video))
+        for number, image in islice(frames, self._chosen.start, self._chosen.stop, self._chosen.step):
+            yield _frame_name(self._video, number), image
+
+
+def images_of(source: Source, names: Sequence[str] | None, n_frames: int) -> Iterator[np.ndarray]:
+    """The images (H, W, 3) uint8 RGB that tracks or a result belong to, in their order, one at a time.
+
+    Args:
+        source: folder, video, or list of image files; it may hold more images than are wanted.
+        names: names of the wanted ones (the tracks' or result's `image_names`), or None where it has none.
+        n_frames: how many are wanted. Where names are unknown to `source`, it must hold just so many.
+
+    Raises:
+        InputError: neither names nor number fit, or what `ImageSequence` raises.
+    """
+    sequence = ImageSequence(source)
+    wanted = set() if names is None else {str(name) for name in names}
+    if wanted and wanted.issubset(sequence.names()):
+        return (image for name, image in sequence if name in wanted)
+    if len(sequence) != n_frames:
+        known = "" if not wanted else f" or some named like {min(wanted)}"
+        raise InputError(f"{source}: holds {len(sequence)} images, expected {n_frames}{known}")
+    return (image for _, image in sequence)
+
+
+def _frame_name(video: Path, number: int) -> str:
+    return f"{video.name} frame {number}"
+
+
+def _video_frames(path: Path) -> Iterator[np.ndarray]:
+    """All images of a video in the order in which they are shown, whatever time lies between them."""
+    with _decoders_messages():
+        capture = cv2.VideoCapture(str(path))
+    try:
+        number = 0
+        while True:
+            with _decoders_messages():
                 read, image = capture.read()
-                if not read:
-                    break
-                yield f"{self._video.name} frame {number}", cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-                number += 1
-        finally:
-            capture.release()
-        if number == 0:
-            raise InputError(f"{self._video}: neither an image nor a video that can be decoded")
+            if not read:
+                break
+            yield cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+            number += 1
+    finally:
+        capture.release()
+    if number == 0:
+        raise InputError(f"{path}: neither an image nor a video that can be decoded; convert it to MP4 or to images")
 
 
 def read_image(path: Path) -> np.ndarray:
     """One image as (H, W, 3) uint8, red, green, blue.
 
     Raises:
-        InputError: no such file, not an image, or cut off.
+        InputError: no such file, not an image, cut off or damaged.
     """
     require_file(path)
     data = path.read_bytes()
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data and _complete(data) else None
+    image = None
+    if data and _complete(data):
+        with _decoders_messages() as messages:
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        if any(_DAMAGED.search(message) for message in messages):
+            raise InputError(f"{path}: is damaged (a part of it cannot be decoded); leave it out or copy it again")
     if image is None:
         raise InputError(f"{path}: cannot be read as an image (truncated or of another format)")
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def png_name(name: str) -> str:
+    """What to call the image of that name when it is written as PNG."""
+    path = Path(name)
+    return f"{path.stem if path.suffix.lower() in _ENDINGS else name}.png"
+
+
+def write_image(path: Path, image: np.ndarray) -> None:
+    """Write an image (H, W, 3) uint8 RGB to a file whose ending names its format."""
+    done, data = cv2.imencode(path.suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    assert done
+    path.write_bytes(data.tobytes())
+
+
+@contextmanager
+def _decoders_messages() -> Iterator[list[bytes]]:
+    """What compiled decoders print on standard error inside the block, instead of printing it; there when it ends."""
+    messages: list[bytes] = []
+    kept = os.dup(2)
+    with tempfile.TemporaryFile() as caught:
+        os.dup2(caught.fileno(), 2)
+        try:
+            yield messages
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+            caught.seek(0)
+            messages.extend(caught.read().splitlines())
 
 
 def _complete(data: bytes) -> bool:

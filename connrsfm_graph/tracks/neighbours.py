@@ -31,8 +31,32 @@ def local_affinity(before: np.ndarray, after: np.ndarray, neighbours: int) -> tu
         return np.tile(np.eye(2), (n, 1, 1)), np.zeros(n)
     k = min(neighbours, n - 1)
     _, near = cKDTree(before).query(before, k + 1)
-    near = near[:, 1:]
-    offset = (before[near] - before[:, None]).astype(np.float64)
+    linear, motion = _fitted(before, after, before, near[:, 1:])
+    return linear, np.linalg.norm(after - before - motion, axis=1)
+
+
+def affinity_at(
+    before: np.ndarray, after: np.ndarray, at: np.ndarray, neighbours: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where the affinities of their surroundings put other points, by the same robust fit.
+
+    Args:
+        before, after: (N, 2) pixels of the same points in two images, N from 4.
+        at: (M, 2) pixels of other points in the first image.
+        neighbours: how many nearest points to use.
+
+    Returns:
+        Places (M, 2) in the second image, and linear parts (M, 2, 2).
+    """
+    _, near = cKDTree(before).query(at, min(neighbours, len(before)))
+    linear, motion = _fitted(before, after, at, near)
+    return at + motion, linear
+
+
+def _fitted(before: np.ndarray, after: np.ndarray, at: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Linear parts (M, 2, 2) of the affinities of points `near` (M, k) places `at` (M, 2), and the motions (M, 2)."""
+    n, k = near.shape
+    offset = (before[near] - at[:, None]).astype(np.float64)
     scale = np.sqrt((offset**2).mean(axis=(1, 2), keepdims=True)) + 1e-9
     design = np.concatenate([offset / scale, np.ones((n, k, 1))], axis=2)
     motion = (after - before)[near].astype(np.float64)
@@ -44,5 +68,4 @@ def local_affinity(before: np.ndarray, after: np.ndarray, neighbours: int) -> tu
         residual = np.linalg.norm(motion - design @ affinity, axis=2)
         typical = 2 * np.median(residual, axis=1, keepdims=True) + _PRECISION
         weight = 1 / (1 + (residual / typical) ** 2)
-    linear = np.eye(2) + (affinity[:, :2] / scale).transpose(0, 2, 1)
-    return linear, np.linalg.norm(after - before - affinity[:, 2], axis=1)
+    return np.eye(2) + (affinity[:, :2] / scale).transpose(0, 2, 1), affinity[:, 2]

@@ -27,12 +27,12 @@ def load_images(folder: Path) -> Tracks:
     Raises:
         InputError: images or intrinsics are missing, or there is not one depth map per image.
     """
-    from connrsfm_graph.tracks.follow import track_images
+    from connrsfm_graph.tracks.front_end import images_to_tracks
 
     masks = folder / "masks"
-    tracks = track_images(
+    tracks = images_to_tracks(
         folder / "images", parse_intrinsics(folder / "K.txt"), masks=masks if masks.is_dir() else None
-    )
+    ).tracks
     if not (folder / "depth").is_dir():
         return tracks
     maps = sorted(path for path in (folder / "depth").iterdir() if path.suffix in DEPTH_KINDS)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from scipy.io import savemat
@@ -157,4 +158,20 @@ def test_track_refuses(connrsfm: Run, tmp_path: Path) -> None:
     refused(connrsfm("track", empty, "--intrinsics", "1,1,0,0", "--out", out), "holds no images")
     refused(connrsfm("track", empty, "--intrinsics", "0,1,0,0", "--out", out), "focal lengths")
     refused(connrsfm("track", empty, "--intrinsics", "1,1,0,0", "--out", tmp_path / "x.csv"), "ends in .npz")
+    refused(
+        connrsfm("track", empty, "--intrinsics", "9,9,0,0", "--out", out, "--distortion", "1,2"), "expected k1,k2,p1,p2"
+    )
+    refused(
+        connrsfm("track", empty, "--intrinsics", "9,9,0,0", "--out", out, "--picture", "a.jpg"),
+        "name that ends in .png",
+    )
+    image = np.random.default_rng(0).integers(0, 255, (60, 80), dtype=np.uint8)
+    cv2.imwrite(str(empty / "0.png"), image)
+    refused(connrsfm("track", empty, "--intrinsics", "9,9,0,0", "--out", out), "shows 1 image, expected at least 3")
+    for number in (1, 2):
+        cv2.imwrite(str(empty / f"{number}.png"), image)
+    cv2.imwrite(str(empty / "1.png"), np.zeros_like(image))
+    refused(connrsfm("track", empty, "--intrinsics", "9,9,0,0", "--out", out), "1.png: is blank", "leave it out")
+    cv2.imwrite(str(empty / "1.png"), image[:50])
+    refused(connrsfm("track", empty, "--intrinsics", "9,9,0,0", "--out", out), "1.png: has 80 x 50 pixels but 0.png")
     assert not out.exists()

@@ -110,6 +110,19 @@ def test_track_follows_images(connrsfm: Run, tmp_path: Path) -> None:
     motion = np.nanmedian(np.diff(tracks.pixels, axis=0), axis=(0, 1))
     np.testing.assert_allclose(motion, [-3, 0], atol=0.1)
 
+    picture, kept = tmp_path / "tracks.png", tmp_path / "kept"
+    arguments = ("track", folder, "--intrinsics", "300,300,90,60", "--out", out, "--set", "points=60")
+    extra = ("--keyframes", 3, "--distortion=-0.01,0,0,0", "--picture", picture, "--save-images", kept)
+    ended = connrsfm(*arguments, *extra)
+    assert ended.status == 0, ended.err
+    assert "in 3 images" in ended.out
+    assert "wrong tracks dropped" in ended.out
+    tracks = load_tracks(out)
+    assert tracks.image_names is not None
+    assert sorted(path.name for path in kept.iterdir()) == list(tracks.image_names)
+    assert cv2.imread(str(kept / tracks.image_names[0])).shape == (120, 180, 3)
+    assert cv2.imread(str(picture)).std() > 20
+
 
 def test_demo_makes_everything_itself(connrsfm: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     small = RenderConfig(frames=4, width=320, height=240, focal=310)
