@@ -149,7 +149,7 @@ class SurfaceSpline:
         self.columns = first[:, None] + self.grid.patch()
         self.rows = rows[:, orders] * unit[:, None]
         self.target = target * unit
-        self.bending = _bending_matrix(self.grid) * extent**2
+        self.bending = bending_matrix(self.grid) * extent**2
         self.robust = np.ones(len(weight))
         self._control: tuple[float, np.ndarray] | None = None
 
@@ -280,7 +280,7 @@ def _terms_of_log(first: np.ndarray, second: np.ndarray, camera: Camera) -> np.n
     return second + camera.kappa * np.stack([y1 * y1, y1 * y2, y2 * y2], axis=-1)
 
 
-def _bending_matrix(grid: SplineGrid) -> np.ndarray:
+def bending_matrix(grid: SplineGrid) -> np.ndarray:
     """(n^2, n^2) integral of S_uu^2 + 2 S_uv^2 + S_vv^2 over the grid, four Gauss points per cell and axis."""
     nodes, weights = np.polynomial.legendre.leggauss(4)
     rows = grid.cell_rows((nodes + 1) / 2)
