@@ -12,6 +12,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--images", type=Path, required=True, metavar="IMAGES", help="folder or video of the images that were tracked"
     )
+    parser.add_argument(
+        "--method", choices=("network", "spline"), help="way to dense depth (default: of smaller cross-validated error)"
+    )
+    parser.add_argument("--checkpoint", type=Path, metavar="CKPT", help="trained network (default: the one shipped)")
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -27,7 +31,7 @@ def run(arguments: argparse.Namespace) -> None:
     reconstruction = Reconstruction.load(out)
     progress = Progress()
     with progress.stage("densify"):
-        index = densify(reconstruction, arguments.images, out, progress.update)
+        index = densify(reconstruction, arguments.images, out, arguments.method, arguments.checkpoint, progress.update)
     for warning in index.warnings:
         print(f"warning: {warning}", file=sys.stderr)
     print(f"{out / DENSE_FOLDER / INDEX_FILE}: {len(index.frames)} surfaces by {index.method} ({index.reason})")

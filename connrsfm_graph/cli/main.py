@@ -12,10 +12,10 @@ import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
-from connrsfm_graph.cli import demo, densify, evaluate, reconstruct, report, settings, slam, track
+from connrsfm_graph.cli import demo, densify, evaluate, reconstruct, report, settings, slam, track, train_depth
 from connrsfm_graph.errors import ComputationError, InputError
 
-COMMANDS = (demo, track, reconstruct, slam, densify, evaluate, report, settings)
+COMMANDS = (demo, track, reconstruct, slam, densify, evaluate, report, train_depth, settings)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -62,7 +62,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", dest="command", required=True)
     for command in COMMANDS:
-        name = command.__name__.rpartition(".")[2]
+        name = command.__name__.rpartition(".")[2].replace("_", "-")
         summary = (command.__doc__ or "").partition("\n")[0]
         sub = commands.add_parser(name, help=summary.rstrip("."), description=summary)
         command.add_arguments(sub)

@@ -5,14 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
+from connrsfm_graph.dense.choose import choose
 from connrsfm_graph.dense.layout import DENSE_FOLDER, SEQUENCE_FILE, DenseFrame, DenseIndex
 from connrsfm_graph.dense.region import surface_region
 from connrsfm_graph.dense.sparse import SparsePoints
-from connrsfm_graph.dense.spline import SplineDepth
 from connrsfm_graph.errors import InputError
 from connrsfm_graph.export.depth_png import png_scale, write_depth_png
 from connrsfm_graph.export.glb import jpeg_of, write_glb, write_glb_sequence
@@ -33,20 +32,12 @@ SECONDS_PER_IMAGE = 0.2
 _CENTRE = (0.3, 0.7)
 
 
-class DepthMethod(Protocol):
-    """A way from sparse points to a depth map."""
-
-    name: str
-
-    def depth(self, points: SparsePoints, size: tuple[int, int]) -> np.ndarray:
-        """(H, W) depth of every pixel of an image of `size` (W, H)."""
-        ...
-
-
 def densify(
     reconstruction: Reconstruction,
     images: Source,
     out: str | Path,
+    method: str | None = None,
+    checkpoint: str | Path | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> DenseIndex:
     """Make the dense surface of every image and write OUT/dense.
@@ -56,21 +47,22 @@ def densify(
         images: the images that were tracked, as a folder, a list of files or a video; more may be there where the
             reconstruction knows their names.
         out: folder of the result.
+        method, checkpoint: see `dense.choose`.
         progress: called with (images done, images).
 
     Raises:
         InputError: images that are not those of the tracks, cannot be read or are of different sizes, or no image with
-            enough points.
+            enough points; and those of `dense.choose`.
     """
     sparse = [SparsePoints.of(reconstruction, f) for f in range(reconstruction.n_frames)]
-    usable = [points for points in sparse if len(points) >= FEWEST_POINTS]
+    usable = [f for f, points in enumerate(sparse) if len(points) >= FEWEST_POINTS]
     if not usable:
         most = max(map(len, sparse))
         raise InputError(f"no image has {FEWEST_POINTS} recovered points (the most are {most}), too few for a surface")
-    scale = png_scale(1.5 * max(float(points.depth.max()) for points in usable))
-    method, reason = SplineDepth(usable), "asked for"
+    scale = png_scale(1.5 * max(float(sparse[f].depth.max()) for f in usable))
+    choice = choose([sparse[f] for f in usable], method, checkpoint)
     frames: list[DenseFrame] = []
-    skipped, warnings = [], []
+    skipped, warnings = [], list(choice.warnings)
     coarse: list[tuple[TexturedMesh, bytes, str]] = []
     size = (0, 0)
     with folder_written_beside(out) as part:
@@ -87,7 +79,7 @@ def densify(
                 skipped.append({"frame": f, "name": name, "reason": reason_skipped})
                 continue
             start = time.perf_counter()
-            depth = np.where(surface_region(points.pixels, size), method.depth(points, size), np.nan)
+            depth = np.where(surface_region(points.pixels, size), choice.method.depth(usable.index(f), size), np.nan)
             mesh = mesh_of_depth(depth, points.K)
             if not len(mesh.triangles):
                 skipped.append({"frame": f, "name": name, "reason": "its points span no surface"})
@@ -115,9 +107,9 @@ def densify(
         meshes, jpegs, names = zip(*coarse, strict=True)
         write_glb_sequence(folder / SEQUENCE_FILE, meshes, jpegs, names, SECONDS_PER_IMAGE)
         index = DenseIndex(
-            method=method.name,
-            reason=reason,
-            checkpoint=None,
+            method=choice.method.name,
+            reason=choice.reason,
+            checkpoint=choice.checkpoint,
             size=list(size),
             depth_png_scale=scale,
             sequence=SEQUENCE_FILE,

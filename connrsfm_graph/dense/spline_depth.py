@@ -21,24 +21,36 @@ CONTROL_POINTS = 20
 
 
 class SplineDepth:
-    """Depth maps by splines; made for all images, asked for one at a time."""
+    """Depth maps by splines; fitted for all images, evaluated one at a time."""
 
     name = "spline"
 
     def __init__(self, images: Sequence[SparsePoints]) -> None:
-        """Choose the bending weight that suits the sparse points of all images."""
-        self.bending = choose_bending([log_depth_spline(points.pixels, np.log(points.depth)) for points in images])
+        """Fit the log depths of every image's points with one bending weight."""
+        self._splines = [log_depth_spline(points.pixels, np.log(points.depth)) for points in images]
+        self.bending = choose_bending(self._splines)
+        self.expected_error = cross_validated_error(self._splines, self.bending)
+        """Root mean square error of log depth that cross-validation expects at a point that was left out."""
 
-    def depth(self, points: SparsePoints, size: tuple[int, int]) -> np.ndarray:
+    def depth(self, number: int, size: tuple[int, int]) -> np.ndarray:
         """(H, W) depth of every pixel of an image of `size` (W, H); beyond the sparse points an extrapolation."""
-        spline = log_depth_spline(points.pixels, np.log(points.depth))
+        spline = self._splines[number]
         return np.exp(on_grid(spline.grid, spline.control(self.bending), np.arange(size[0]), np.arange(size[1])))
 
 
-def log_depth_spline(pixels: np.ndarray, log_depth: np.ndarray) -> SurfaceSpline:
+def log_depth_spline(pixels: np.ndarray, log_depth: np.ndarray, control_points: int = CONTROL_POINTS) -> SurfaceSpline:
     """Spline fitted to log depths (N,) at places (N, 2)."""
     ones = np.ones(len(pixels))
-    return SurfaceSpline(pixels, (VALUE,), log_depth[:, None], ones, pixels, CONTROL_POINTS, PERSPECTIVE)
+    return SurfaceSpline(pixels, (VALUE,), log_depth[:, None], ones, pixels, control_points, PERSPECTIVE)
+
+
+def cross_validated_error(splines: Sequence[SurfaceSpline], bending: float) -> float:
+    """Root mean square of the error at points left out, by generalised cross-validation over all splines together."""
+    scores = [spline.score(np.array([bending])) for spline in splines]
+    rss = sum(float(score[0][0]) for score in scores)
+    parameters = sum(float(score[1][0]) for score in scores)
+    size = sum(score[2] for score in scores)
+    return float(np.sqrt(rss / size) / max(1.0 - parameters / size, 1e-3))
 
 
 def on_grid(grid: SplineGrid, control: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
