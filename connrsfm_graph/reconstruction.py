@@ -15,6 +15,7 @@ import numpy as np
 
 from connrsfm_graph.errors import InputError
 from connrsfm_graph.files import read_npz, require_file, written_beside
+from factors.surface import CAMERAS, PERSPECTIVE, Camera
 
 RESULT_FILE = "result.npz"
 RECORD_FILE = "run.json"
@@ -31,7 +32,7 @@ class Reconstruction:
     pixels: np.ndarray
     """(F, P, 2) the input tracks in pixels, NaN where not visible."""
     K: np.ndarray
-    """(F, 3, 3) pinhole intrinsics of every image."""
+    """(F, 3, 3) intrinsics of every image: pinhole, or pixels per unit and principal point where orthographic."""
     visible: np.ndarray
     """(F, P) bool, the point was observed in that image."""
     points: np.ndarray
@@ -65,6 +66,9 @@ class Reconstruction:
     inverted about the camera centre, but only together. None where no image is ambiguous."""
     alternative: np.ndarray | None = None
     """(F, P, 3) the points with all ambiguous images inverted; None where no image is ambiguous."""
+    camera: Camera = PERSPECTIVE
+    """How a pixel sees. The depth of an orthographic camera is about its mean in each image, its terms are derivatives
+    of depth as they stand, and the mirror image of all surfaces in depth fits as well."""
 
     @property
     def n_frames(self) -> int:
@@ -86,6 +90,7 @@ class Reconstruction:
     def save(self, path: str | Path) -> None:
         """Write `result.npz`; the same reconstruction gives the same bytes."""
         arrays = {item.name: getattr(self, item.name) for item in fields(self)}
+        arrays["camera"] = None if self.camera is PERSPECTIVE else np.array(self.camera.name)
         with written_beside(path) as part, part.open("wb") as stream:
             np.savez_compressed(stream, allow_pickle=False, **{k: v for k, v in arrays.items() if v is not None})
 
@@ -112,7 +117,10 @@ class Reconstruction:
         optional = {
             name: _checked(arrays, name, spec, sizes, str(path)) for name, spec in _OPTIONAL.items() if name in arrays
         }
-        return Reconstruction(**known, **optional, image_names=names)
+        camera = str(arrays.get("camera", PERSPECTIVE.name))
+        if camera not in CAMERAS:
+            raise InputError(f"{path}: 'camera' is '{camera}', expected one of {', '.join(CAMERAS)}")
+        return Reconstruction(**known, **optional, image_names=names, camera=CAMERAS[camera])
 
 
 # Shape by symbol (numbers are literal) and kind of every field of the file.

@@ -29,6 +29,8 @@ from factors.noise import PairNoise
 
 JOINT = ("d", "c", "s")
 """Active variables of the joint schedule; depths follow by integration, since pair factors do not see them."""
+JOINT_KNOWN_SCALE = ("d", "c")
+"""The same for orthographic cameras: with the scale of a pair free, its metric would fit every slope."""
 OFF_SURFACE = 3.0
 """Misfit of a point's first-order terms, in medians over all, from which it starts again from the surface."""
 RESTART_GAIN = 1e-3
@@ -87,7 +89,7 @@ def solve(
     state, costs = start, []
     if config.schedule == "joint":
         costs.append(total_cost(problem, state, backend, config.noise))
-        minimum = backend.minimise(problem, state, JOINT, config.noise, settings=config.levenberg)
+        minimum = backend.minimise(problem, state, _joint(problem), config.noise, settings=config.levenberg)
         costs.append(float(minimum.cost.sum()))
         for _ in range(config.restarts):
             minimum, improved = _restart_from_surface(problem, minimum, backend, config)
@@ -113,8 +115,8 @@ def _restart_from_surface(
     start = minimum.state.updated(first_order=surface.first_order, second_order=surface.second_order)
     start = State(start.frame[again], start.log_scale[again])
     part = problem.points(again)
-    start = with_closed_form_scale(part, start, config.noise)
-    trial = backend.minimise(part, start, JOINT, config.noise, settings=config.levenberg)
+    start = _with_scale(part, start, config.noise)
+    trial = backend.minimise(part, start, _joint(part), config.noise, settings=config.levenberg)
     better = trial.cost < (1.0 - RESTART_GAIN) * minimum.cost[again]
     chosen = again[better]
     kept = Minimum(minimum.state.updated(), minimum.cost.copy(), minimum.iterations.copy())
@@ -152,7 +154,15 @@ def _separable(
 
 
 def _with_depth(problem: Problem, state: State, integrated: Integrated, noise: PairNoise) -> State:
-    return with_closed_form_scale(problem, state.updated(log_depth=integrated.log_depth), noise)
+    return _with_scale(problem, state.updated(log_depth=integrated.log_depth), noise)
+
+
+def _with_scale(problem: Problem, state: State, noise: PairNoise) -> State:
+    return with_closed_form_scale(problem, state, noise) if problem.camera.kappa else state
+
+
+def _joint(problem: Problem) -> tuple[str, ...]:
+    return JOINT if problem.camera.kappa else JOINT_KNOWN_SCALE
 
 
 def _indices(costs: list[float]) -> list[float]:

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from connrsfm_graph.errors import InputError
 from connrsfm_graph.synthetic.jet import Jet
 from connrsfm_graph.synthetic.scene import FOCAL_LENGTH, HEIGHT, WIDTH, Scene, facing, inward_normal
+from factors.surface import PERSPECTIVE, Camera
 
 LEAST_FACING = 0.1
 """Points keep about 6 degrees from the horizon, where no tracker would hold them."""
@@ -24,13 +25,20 @@ SHEET = np.array([1.0, 0.75])
 """Half-sides of the flat sheet."""
 
 
-def spheres(n_frames: int = 7, n_points: int = 100, half_angle_deg: float = 35.0, seed: int = 0) -> Scene:
+def spheres(
+    n_frames: int = 7,
+    n_points: int = 100,
+    half_angle_deg: float = 35.0,
+    seed: int = 0,
+    camera: Camera = PERSPECTIVE,
+) -> Scene:
     """Caps of spheres related by similarities x -> s R x + t (the paper's verification and first data set).
 
     Args:
         n_frames, n_points: F and P.
         half_angle_deg: angle between the axis of the cap and its rim.
         seed: of points, radii (0.5 to 2), rotations and positions.
+        camera: of all frames.
     """
     rng = np.random.default_rng(seed)
     across = np.sqrt(1.0 - rng.uniform(np.cos(np.radians(half_angle_deg)), 1.0, n_points) ** 2)
@@ -41,11 +49,16 @@ def spheres(n_frames: int = 7, n_points: int = 100, half_angle_deg: float = 35.0
     def draw() -> Jet:
         return _placed(cap * rng.uniform(0.5, 2.0), rng.uniform(-1.0, 1.0, 6), tilt_deg=30.0, fill=(0.6, 0.95))
 
-    return Scene.of([_facing_draw(draw) for _ in range(n_frames)])
+    return Scene.of([_facing_draw(draw, camera) for _ in range(n_frames)], camera)
 
 
 def isometric_bending(
-    n_frames: int = 10, n_points: int = 100, bend: float = 0.8, smooth: bool = False, seed: int = 0
+    n_frames: int = 10,
+    n_points: int = 100,
+    bend: float = 0.8,
+    smooth: bool = False,
+    seed: int = 0,
+    camera: Camera = PERSPECTIVE,
 ) -> Scene:
     """A sheet rolled to cylinders of varying radius and axis, moved rigidly: isometric, not similar.
 
@@ -54,6 +67,7 @@ def isometric_bending(
         bend: largest curvature, in radians over half the sheet's width.
         smooth: whether frames follow one another in a smooth motion, as in a video, or are drawn independently.
         seed: of points and motion.
+        camera: of all frames.
     """
     rng = np.random.default_rng(seed)
     sheet = _sheet(n_points, rng)
@@ -62,8 +76,10 @@ def isometric_bending(
         return _placed(_rolled(sheet, bend * motion[0], np.pi * motion[1]), motion[2:], tilt_deg=25.0, fill=(0.75, 1.0))
 
     if not smooth:
-        return Scene.of([_facing_draw(lambda: draw(rng.uniform(-1.0, 1.0, 8))) for _ in range(n_frames)])
-    return Scene.of(_facing_draws(lambda: [draw(motion) for motion in _smooth_motion(n_frames, 8, rng)]))
+        surfaces = [_facing_draw(lambda: draw(rng.uniform(-1.0, 1.0, 8)), camera) for _ in range(n_frames)]
+    else:
+        surfaces = _facing_draws(lambda: [draw(motion) for motion in _smooth_motion(n_frames, 8, rng)], camera)
+    return Scene.of(surfaces, camera)
 
 
 def moebius(
@@ -174,14 +190,14 @@ def _smooth_motion(n_frames: int, n_series: int, rng: np.random.Generator) -> np
     return (wave * rng.dirichlet(np.ones(3), n_series)).sum(axis=-1)
 
 
-def _facing_draw(draw: Callable[[], Jet]) -> Jet:
-    return _facing_draws(lambda: [draw()])[0]
+def _facing_draw(draw: Callable[[], Jet], camera: Camera = PERSPECTIVE) -> Jet:
+    return _facing_draws(lambda: [draw()], camera)[0]
 
 
-def _facing_draws(draw: Callable[[], list[Jet]]) -> list[Jet]:
+def _facing_draws(draw: Callable[[], list[Jet]], camera: Camera) -> list[Jet]:
     """Draw until every surface faces the camera everywhere."""
     for _ in range(1000):
         surfaces = draw()
-        if all(facing(surface).min() > LEAST_FACING for surface in surfaces):
+        if all(facing(surface, camera).min() > LEAST_FACING for surface in surfaces):
             return surfaces
     raise InputError("no frame of the synthetic scene faces the camera everywhere; ask for a flatter surface")

@@ -17,19 +17,23 @@ from connrsfm_graph.tracks.intrinsics import parse_intrinsics
 from connrsfm_graph.tracks.matlab import read_mat
 from connrsfm_graph.tracks.table import read_csv
 from connrsfm_graph.tracks.tracks import Tracks
+from factors.surface import PERSPECTIVE
 
 MAX_BYTES = 8 * 2**30
 """Largest array content a file may declare; beyond that it is taken for damaged rather than read."""
 
 
-def load_tracks(path: str | Path, intrinsics: str | Path | np.ndarray | None = None) -> Tracks:
+def load_tracks(
+    path: str | Path, intrinsics: str | Path | np.ndarray | None = None, camera: str | None = None
+) -> Tracks:
     """Read tracks from a file.
 
     Args:
-        path: `.npz` with `tracks`, `K` and optionally `visible`, `points`, `normals`, `image_names`; `.mat`
-            (`connrsfm_graph.tracks.matlab` lists the layouts); or `.csv` with columns frame, point, x, y.
+        path: `.npz` with `tracks`, `K` and optionally `visible`, `points`, `normals`, `image_names`, `camera`;
+            `.mat` (`connrsfm_graph.tracks.matlab` lists the layouts); or `.csv` with columns frame, point, x, y.
         intrinsics: (3, 3) matrix, "fx,fy,cx,cy" or the path of a text file with either; overrides the file's own and
             is needed where the file has none.
+        camera: `perspective` or `orthographic`, overrides the file's own; perspective where neither says.
 
     Raises:
         InputError: one sentence that names the file, the field and what was expected.
@@ -41,11 +45,11 @@ def load_tracks(path: str | Path, intrinsics: str | Path | np.ndarray | None = N
         raise InputError(f"{path}: is empty, expected tracks")
     match path.suffix.lower():
         case ".npz":
-            return _read_npz(path, K)
+            return _read_npz(path, K, camera)
         case ".mat":
-            return read_mat(path, K)
+            return read_mat(path, K, camera or PERSPECTIVE.name)
         case ".csv" | ".txt":
-            return read_csv(path, K)
+            return read_csv(path, K, camera or PERSPECTIVE.name)
         case suffix:
             raise InputError(f"{path}: unknown ending '{suffix}', expected .npz, .mat or .csv")
 
@@ -63,12 +67,13 @@ def save_tracks(path: str | Path, tracks: Tracks) -> None:
         "points": tracks.points,
         "normals": tracks.normals,
         "image_names": None if tracks.image_names is None else np.array(tracks.image_names),
+        "camera": None if tracks.camera is PERSPECTIVE else np.array(tracks.camera.name),
     }
     with written_beside(path) as part, part.open("wb") as stream:
         np.savez_compressed(stream, allow_pickle=False, **{k: v for k, v in arrays.items() if v is not None})
 
 
-def _read_npz(path: Path, K: np.ndarray | None) -> Tracks:
+def _read_npz(path: Path, K: np.ndarray | None, camera: str | None) -> Tracks:
     _refuse_huge(path)
     try:
         arrays = read_npz(path)
@@ -82,6 +87,8 @@ def _read_npz(path: Path, K: np.ndarray | None) -> Tracks:
     names = arrays.get("image_names")
     if names is not None and (names.ndim != 1 or names.dtype.kind != "U"):
         raise InputError(f"{path}: 'image_names' is not a list of names")
+    if camera is None:
+        camera = str(arrays.get("camera", PERSPECTIVE.name))
     return Tracks.checked(
         pixels=arrays["tracks"],
         K=arrays["K"] if K is None else K,
@@ -89,6 +96,7 @@ def _read_npz(path: Path, K: np.ndarray | None) -> Tracks:
         points=arrays.get("points"),
         normals=arrays.get("normals"),
         image_names=None if names is None else names.tolist(),
+        camera=camera,
         source=str(path),
     )
 

@@ -22,15 +22,16 @@ import numpy as np
 
 from connrsfm_graph.errors import InputError
 from connrsfm_graph.tracks.tracks import Tracks
+from factors.surface import PERSPECTIVE
 
 _IMAGE_FIELDS = ("m", "p", "qgth")
 _NORMALISED_LIMIT = 10.0
 
 
-def read_mat(path: Path, K: np.ndarray | None) -> Tracks:
+def read_mat(path: Path, K: np.ndarray | None, camera: str = PERSPECTIVE.name) -> Tracks:
     """Read one of the layouts above; `K` overrides the file's camera.
 
-    Truth with non-positive depth means "unknown" in these files and becomes NaN.
+    Truth with non-positive depth means "unknown" in these files of perspective cameras and becomes NaN.
 
     Raises:
         InputError: another kind of file, none of the known fields, no camera, or shapes that do not fit.
@@ -53,8 +54,9 @@ def read_mat(path: Path, K: np.ndarray | None) -> Tracks:
     truth = None
     if "Pgth" in fields:
         truth = _by_frame(fields["Pgth"], 3, f"{path}: 'Pgth'")[..., :3]
-        truth = np.where(truth[..., 2:] > 0, truth, np.nan)
-    return Tracks.checked(image, K, visible, truth, source=str(path))
+        if camera == PERSPECTIVE.name:
+            truth = np.where(truth[..., 2:] > 0, truth, np.nan)
+    return Tracks.checked(image, K, visible, truth, camera=camera, source=str(path))
 
 
 def _load(path: Path) -> dict[str, Any]:

@@ -10,12 +10,13 @@ import numpy as np
 
 from connrsfm_graph.errors import InputError
 from connrsfm_graph.tracks.tracks import Tracks
+from factors.surface import PERSPECTIVE
 
 _COLUMNS = ("frame", "point", "x", "y")
 _MAX_ENTRIES = 200_000_000
 
 
-def read_csv(path: Path, K: np.ndarray | None) -> Tracks:
+def read_csv(path: Path, K: np.ndarray | None, camera: str = PERSPECTIVE.name) -> Tracks:
     """Read a comma-separated table whose first line names at least the columns frame, point, x and y.
 
     Frame and point numbers may start anywhere and have gaps: the images and points are those that occur, in ascending
@@ -41,7 +42,7 @@ def read_csv(path: Path, K: np.ndarray | None) -> Tracks:
     tracks = np.full((len(frames), len(points), 2), np.nan)
     tracks[frame, point] = pixels
     names = [f"frame {number}" for number in frames]
-    return Tracks.checked(tracks, K, image_names=names, source=str(path))
+    return Tracks.checked(tracks, K, image_names=names, camera=camera, source=str(path))
 
 
 def _rows(path: Path) -> tuple[np.ndarray, np.ndarray, list[int]]:

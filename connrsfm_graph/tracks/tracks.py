@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from connrsfm_graph.errors import InputError
+from factors.surface import CAMERAS, PERSPECTIVE, Camera
 
 
 @dataclass(frozen=True)
@@ -17,7 +18,8 @@ class Tracks:
     pixels: np.ndarray
     """(F, P, 2) pixel coordinates, x right, y down, 0-based; NaN exactly where not visible."""
     K: np.ndarray
-    """(F, 3, 3) pinhole intrinsics of every image."""
+    """(F, 3, 3) intrinsics of every image: pinhole, or pixels per unit of length and principal point of an orthographic
+    camera."""
     visible: np.ndarray
     """(F, P) bool, observed in that image."""
     points: np.ndarray | None = None
@@ -26,6 +28,8 @@ class Tracks:
     """(F, P, 3) true unit normals towards the camera, NaN where unknown."""
     image_names: tuple[str, ...] | None = None
     """File name of every image."""
+    camera: Camera = PERSPECTIVE
+    """How a pixel sees. Points of an orthographic camera are (u, v, beta), with a depth beta that may have any sign."""
 
     @property
     def n_frames(self) -> int:
@@ -64,6 +68,14 @@ class Tracks:
             image_names=names,
         )
 
+    def mirrored(self) -> Tracks:
+        """The tracks with the true surfaces mirrored in depth, which an orthographic camera sees alike."""
+        points, normals = (
+            None if array is None else array * sign
+            for array, sign in ((self.points, np.array([1.0, 1.0, -1.0])), (self.normals, np.array([-1.0, -1.0, 1.0])))
+        )
+        return replace(self, points=points, normals=normals)
+
     @staticmethod
     def checked(
         pixels: np.ndarray,
@@ -72,6 +84,7 @@ class Tracks:
         points: np.ndarray | None = None,
         normals: np.ndarray | None = None,
         image_names: Sequence[str] | None = None,
+        camera: str = PERSPECTIVE.name,
         source: str = "tracks",
     ) -> Tracks:
         """Validate arrays and build `Tracks`.
@@ -82,6 +95,7 @@ class Tracks:
             visible: (F, P) bool; where absent, the finite entries of `pixels`.
             points, normals: (F, P, 3) or None.
             image_names: F names or None.
+            camera: `perspective` or `orthographic`.
             source: what to call the input in messages, usually the file's name.
 
         Raises:
@@ -114,6 +128,8 @@ class Tracks:
                 "mark it not visible or give its pixel"
             )
         pixels = np.where(visible[..., None], pixels, np.nan)
+        if camera not in CAMERAS:
+            raise InputError(f"{source}: 'camera' is '{camera}', expected one of {', '.join(CAMERAS)}")
         if image_names is not None and len(image_names) != F:
             raise InputError(f"{source}: 'image_names' has {len(image_names)} entries, expected {F}")
         return Tracks(
@@ -123,6 +139,7 @@ class Tracks:
             points=_truth(points, (F, P, 3), f"{source}: 'points'"),
             normals=_truth(normals, (F, P, 3), f"{source}: 'normals'"),
             image_names=None if image_names is None else tuple(str(name) for name in image_names),
+            camera=CAMERAS[camera],
         )
 
 
