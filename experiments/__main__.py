@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from experiments import accuracy, theorem
+from experiments import accuracy, cloth, theorem
 from experiments.ablations import ABLATION, EDGES, ITERATIONS, STARTING_VALUES
 from experiments.missing import MISSING
 from experiments.real import FLAG, KINECT_PAPER, TSHIRT
@@ -46,6 +46,7 @@ def verify_theorem(options: Options) -> None:
 EXPERIMENTS: dict[str, Callable[[Options], None]] = {
     "theorem": verify_theorem,
     **{experiment.name: experiment for experiment in TABLES},
+    "cloth": cloth.measure,
     "accuracy": accuracy.measure,
     "summary": summarise,
 }

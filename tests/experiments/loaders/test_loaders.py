@@ -66,7 +66,7 @@ def test_a_small_file_of_the_layout_is_read(name: str, tmp_path: Path, tracks: T
 
 
 def test_every_data_set_says_where_it_is_to_be_had(capsys: pytest.CaptureFixture[str]) -> None:
-    assert set(datasets()) == {*WRITERS, "mandala", "hamlyn"}
+    assert set(datasets()) == {*WRITERS, "mandala", "hamlyn", "cloth_r1"}
     assert main([]) == 0
     listed = capsys.readouterr().out
     assert all(name in listed and dataset.source in listed for name, dataset in datasets().items())
