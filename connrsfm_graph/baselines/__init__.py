@@ -27,6 +27,8 @@ def _imported(name: str) -> Method:
     """The function `reconstruct` of the baseline's module, imported when it is called."""
 
     def run(tracks: Tracks, config: Config, progress: Progress) -> tuple[Reconstruction, RunRecord]:
+        if not tracks.camera.kappa:
+            raise InputError(f"the baseline '{name}' is for perspective cameras, the tracks are {tracks.camera.name}")
         try:
             module = import_module(f"connrsfm_graph.baselines.{name}")
         except ModuleNotFoundError as error:

@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from connrsfm_graph.metrics import Evaluation
     from connrsfm_graph.reconstruction import Reconstruction
     from connrsfm_graph.tracks import Tracks
@@ -25,13 +27,18 @@ def run(arguments: argparse.Namespace) -> None:
     from connrsfm_graph.tracks import load_tracks
 
     reconstruction = Reconstruction.load(arguments.result)
-    truth = load_tracks(arguments.truth, arguments.intrinsics)
-    evaluation = evaluated(reconstruction, truth, str(arguments.truth))
+    truth = load_tracks(arguments.truth, arguments.intrinsics, reconstruction.camera.name)
+    evaluation, _ = evaluated(reconstruction, truth, str(arguments.truth))
     print(json.dumps(evaluation.to_dict(), allow_nan=False) if arguments.json else table(evaluation))
 
 
-def evaluated(reconstruction: Reconstruction, truth: Tracks, source: str) -> Evaluation:
+def evaluated(reconstruction: Reconstruction, truth: Tracks, source: str) -> tuple[Evaluation, np.ndarray]:
     """Figures of a reconstruction against tracks with true points; `source` names these in messages.
+
+    An orthographic camera cannot tell all surfaces from their mirror images in depth: the nearer of both truths counts.
+
+    Returns:
+        The figures, and the true points (F, P, 3) that they belong to.
 
     Raises:
         InputError: no true points, or those of other images or points.
@@ -44,13 +51,20 @@ def evaluated(reconstruction: Reconstruction, truth: Tracks, source: str) -> Eva
     if truth.points.shape != reconstruction.points.shape:
         sizes = [" x ".join(map(str, array.shape[:2])) for array in (truth.points, reconstruction.points)]
         raise InputError(f"{source}: 'points' holds {sizes[0]} (frames x points), the result {sizes[1]}")
-    return evaluate(
-        reconstruction.points,
-        truth.points,
-        truth.visible,
-        normals=reconstruction.normals,
-        true_normals=truth.normals,
-    )
+    perspective = bool(reconstruction.camera.kappa)
+    found = []
+    for candidate in [truth] if perspective else [truth, truth.mirrored()]:
+        assert candidate.points is not None
+        evaluation = evaluate(
+            reconstruction.points,
+            candidate.points,
+            truth.visible,
+            normals=reconstruction.normals,
+            true_normals=candidate.normals,
+            image=None if perspective else reconstruction.points[..., :2],
+        )
+        found.append((evaluation, candidate.points))
+    return min(found, key=lambda pair: pair[0].e3d_percent)
 
 
 def summary(evaluation: Evaluation) -> str:

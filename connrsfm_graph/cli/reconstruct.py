@@ -28,6 +28,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--intrinsics", metavar="K", help="fx,fy,cx,cy or a text file with a 3 x 3 matrix, instead of the file's own"
     )
+    parser.add_argument(
+        "--camera",
+        choices=("perspective", "orthographic"),
+        help="how a pixel sees, instead of what the file says (perspective where it says nothing); for an orthographic "
+        "camera fx, fy are pixels per unit of length",
+    )
     parser.add_argument("--method", default=DEFAULT_METHOD, help="method or baseline (default: %(default)s)")
     add_configuration(parser)
     parser.add_argument("--no-report", action="store_true", help="write no page with pictures")
@@ -40,7 +46,7 @@ def run(arguments: argparse.Namespace) -> None:
 
     check_output_folder(arguments.out)
     config = resolved(arguments)
-    tracks = load_tracks(arguments.tracks, arguments.intrinsics)
+    tracks = load_tracks(arguments.tracks, arguments.intrinsics, arguments.camera)
     reconstruct_into(
         arguments.out,
         tracks,
@@ -95,7 +101,7 @@ def reconstruct_into(
         from connrsfm_graph.cli.evaluate import evaluated, summary
 
         try:
-            evaluation = evaluated(reconstruction, tracks, source)
+            evaluation, truth = evaluated(reconstruction, tracks, source)
             print(summary(evaluation))
         except InputError as error:  # the result stands, whatever is wrong with the truth
             print(f"warning: not evaluated: {error}", file=sys.stderr)

@@ -18,7 +18,7 @@ def run(arguments: argparse.Namespace) -> None:
     from connrsfm_graph.reconstruction import Reconstruction, RunRecord
     from connrsfm_graph.report.page import write_report
     from connrsfm_graph.tracks import load_tracks
-    from connrsfm_graph.tracks.images import ImageSequence
+    from connrsfm_graph.tracks.images import images_of
 
     out = arguments.result
     if out.exists() and not out.is_dir():
@@ -26,11 +26,9 @@ def run(arguments: argparse.Namespace) -> None:
     reconstruction, record = Reconstruction.load(out), RunRecord.load(out)
     truth = evaluation = images = None
     if arguments.truth is not None:
-        tracks = load_tracks(arguments.truth)
-        evaluation = evaluated(reconstruction, tracks, str(arguments.truth))
-        truth = tracks.points
+        tracks = load_tracks(arguments.truth, camera=reconstruction.camera.name)
+        evaluation, truth = evaluated(reconstruction, tracks, str(arguments.truth))
     if arguments.images is not None:
-        images = [image for _, image in ImageSequence(arguments.images)]
-        if len(images) != reconstruction.n_frames:
-            raise InputError(f"{arguments.images}: holds {len(images)} images, expected {reconstruction.n_frames}")
+        names = None if reconstruction.image_names is None else reconstruction.image_names.tolist()
+        images = images_of(arguments.images, names, reconstruction.n_frames)
     print(write_report(out, reconstruction, record, truth, evaluation, images))

@@ -5,6 +5,8 @@
 | `W` | (2F, P) | pixels, x and y of each image; NaN where not visible |
 | `GT`, `S` or `shape3D` | (3F, P) | truth in each camera's frame, optional |
 | `K` | (3, 3) | intrinsics; or `K.txt` beside the file |
+
+Orthographic sequences have no `K`: their image points are in the unit of length of the truth.
 """
 
 from __future__ import annotations
@@ -16,12 +18,17 @@ import numpy as np
 from connrsfm_graph.errors import InputError
 from connrsfm_graph.tracks import Tracks, parse_intrinsics
 from experiments.loaders._matlab import only_file
+from factors.surface import ORTHOGRAPHIC, PERSPECTIVE
 
 TRUTH = ("GT", "S", "shape3D")
 
 
-def load_stacked(folder: Path) -> Tracks:
+def load_stacked(folder: Path, orthographic: bool = False) -> Tracks:
     """The folder's one `.mat` file in the layout above.
+
+    Args:
+        folder: where it is.
+        orthographic: whether a file without a camera is taken for an orthographic sequence.
 
     Raises:
         InputError: `W` or the camera is missing, or shapes do not fit.
@@ -35,11 +42,13 @@ def load_stacked(folder: Path) -> Tracks:
         raise InputError(f"{path}: not a readable .mat file (damaged, or saved as v7.3)") from error
     if "W" not in fields:
         raise InputError(f"{path}: field 'W' is missing, expected a measurement matrix with two rows per image")
-    camera = folder / "K.txt"
+    camera, model = folder / "K.txt", PERSPECTIVE
     if camera.exists():
         K = parse_intrinsics(camera)
     elif "K" in fields:
         K = np.asarray(fields["K"], dtype=float)
+    elif orthographic:
+        K, model = np.eye(3), ORTHOGRAPHIC
     else:
         raise InputError(f"{path}: field 'K' is missing, expected it there or in {camera}")
     truth = next((fields[name] for name in TRUTH if name in fields), None)
@@ -47,6 +56,7 @@ def load_stacked(folder: Path) -> Tracks:
         _by_image(fields["W"], 2, f"{path}: 'W'"),
         K,
         points=None if truth is None else _by_image(truth, 3, f"{path}: truth"),
+        camera=model.name,
         source=str(path),
     )
 

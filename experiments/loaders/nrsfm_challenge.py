@@ -1,6 +1,8 @@
-"""NRSfM Challenge, sequences seen by perspective cameras; the orthographic ones need another camera model."""
+"""NRSfM Challenge: sequences seen by perspective cameras, and the same by orthographic ones."""
 
 from __future__ import annotations
+
+from functools import partial
 
 from experiments.loaders import Dataset
 from experiments.loaders._stacked import load_stacked
@@ -8,6 +10,6 @@ from experiments.loaders._stacked import load_stacked
 DATASET = Dataset(
     "NRSfM Challenge, five deforming objects on six camera paths",
     "nrsfm2017.compute.dtu.dk (Jensen, Doest, Aanæs, Del Bue, IJCV 2021)",
-    "one .mat file of a perspective sequence with W, NaN where not visible, GT and K",
-    load_stacked,
+    "one .mat file of a sequence with W, NaN where not visible, and GT; with K perspective, without orthographic",
+    partial(load_stacked, orthographic=True),
 )
