@@ -32,6 +32,8 @@ PADDING = 0.05
 """Margin of the spline's grid around the points, relative to their extent."""
 SMOOTHINGS = np.logspace(-9, 1, 61)
 """Bending weights among which cross-validation chooses."""
+SCORED = 16
+"""Images on which it tries them, at most."""
 
 
 @dataclass(frozen=True)
@@ -212,16 +214,25 @@ class SurfaceSpline:
 
 
 def terms_of_depth(
-    image: np.ndarray, log_depth: np.ndarray, known: np.ndarray, camera: Camera, control_points: int = 14
-) -> tuple[np.ndarray, np.ndarray]:
-    """First- (F, P, 2) and second-order terms (F, P, 3) of surfaces given by their depths, by cross-validated splines.
+    image: np.ndarray,
+    log_depth: np.ndarray,
+    known: np.ndarray,
+    camera: Camera,
+    bending: float | None = None,
+    control_points: int = 14,
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """First- (F, P, 2) and second-order terms (F, P, 3) of surfaces given by their depths, by smoothing splines.
 
     Args:
         image: (F, P, 2) normalised coordinates of the surface points, finite where known.
-        log_depth: (F, P).
+        log_depth: (F, P); of an orthographic camera depth itself.
         known: (F, P) bool; at least three points per image. Terms are 0 elsewhere.
         camera: camera model.
+        bending: weight of the bending energy; chosen by cross-validation where None.
         control_points: of the spline per axis, at most.
+
+    Returns:
+        The terms and the bending weight.
     """
     splines = [
         SurfaceSpline(
@@ -235,16 +246,18 @@ def terms_of_depth(
         )
         for j, seen in enumerate(known)
     ]
-    bending = choose_bending(splines)
+    if bending is None:
+        bending = choose_bending(splines)
     first, second = np.zeros((*known.shape, 2)), np.zeros((*known.shape, 3))
     for j, (spline, seen) in enumerate(zip(splines, known, strict=True)):
         _, first[j, seen], second[j, seen] = spline.surface(image[j, seen], bending)
-    return first, second
+    return first, second, bending
 
 
 def choose_bending(systems: list[SurfaceSpline]) -> float:
-    """Bending weight of least generalised cross-validation score over all images."""
-    scores = [system.score(SMOOTHINGS) for system in systems]
+    """Bending weight of least generalised cross-validation score over up to `SCORED` images spread over all."""
+    some = np.unique(np.linspace(0, len(systems) - 1, min(len(systems), SCORED)).round().astype(int))
+    scores = [systems[j].score(SMOOTHINGS) for j in some]
     rss = sum(score[0] for score in scores)
     parameters = sum(score[1] for score in scores)
     size = sum(score[2] for score in scores)

@@ -2,12 +2,13 @@
 
     tracks -> image graph -> warps -> problem -> pre-step -> solve and integrate -> refine -> surfaces
 
-Every stage is a function of frozen data and can be called alone.
+Every stage is a function of frozen data and can be called alone. Of a long sequence the stages see the keyframes only;
+the other images follow these in blocks.
 """
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -17,9 +18,11 @@ from threadpoolctl import threadpool_limits
 from connrsfm_graph.config import as_dict
 from connrsfm_graph.errors import ComputationError
 from connrsfm_graph.image_graph import GraphConfig, ImageGraph, select_edges
-from connrsfm_graph.initialise import Start, initialise, with_closed_form_scale
-from connrsfm_graph.integrate import IntegrationConfig, terms_of_depth
-from connrsfm_graph.problem import Problem, State, make_problem
+from connrsfm_graph.initialise import Start, initialise
+from connrsfm_graph.integrate import IntegrationConfig
+from connrsfm_graph.keyframes import KeyframeConfig, choose_keyframes
+from connrsfm_graph.others import Guide, Others, reconstruct_others
+from connrsfm_graph.problem import Problem, make_problem
 from connrsfm_graph.progress import Progress
 from connrsfm_graph.reconstruction import Reconstruction, RunRecord, package_versions, peak_memory_mib
 from connrsfm_graph.refine import RefineConfig, Refined, refine
@@ -27,22 +30,23 @@ from connrsfm_graph.solvers.batched import BatchedBackend
 from connrsfm_graph.solvers.gtsam_backend import GtsamBackend
 from connrsfm_graph.solvers.interface import Backend
 from connrsfm_graph.solvers.separable import SolveConfig, Solved, solve
+from connrsfm_graph.surfaces import Surfaces, scales, surfaces_of_points, surfaces_of_terms
 from connrsfm_graph.tracks import Tracks
 from connrsfm_graph.warps import WarpConfig, Warps, estimate_pixel_noise, fit_warps
 from connrsfm_graph.warps.cycles import cycle_agreement
-from factors.noise import PairNoise
-from factors.surface import PERSPECTIVE, normals
 
 NOISY = 0.05
 """Misfit of the warps, relative to the points' spread, from which the user is warned."""
-METRIC_ONLY = PairNoise(intrinsic=math.inf, extrinsic=math.inf)
-"""For the scale of a finished surface: only the metric rows hold for every conformal map."""
+BLOCK = 32
+"""Images that follow the keyframes at a time."""
 
 
 @dataclass(frozen=True)
 class Config:
     """Settings of every stage."""
 
+    keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
+    """Which images of a long sequence are reconstructed jointly."""
     graph: GraphConfig = field(default_factory=GraphConfig)
     """Which pairs of images are used."""
     warps: WarpConfig = field(default_factory=WarpConfig)
@@ -69,6 +73,22 @@ def default_config(mode: Literal["default", "paper"] = "default") -> Config:
     return Config(warps=WarpConfig(model="schwarzian"), solve=SolveConfig(schedule="separable"), refinement=False)
 
 
+@dataclass(frozen=True)
+class Joint:
+    """Images reconstructed jointly, with all that the stages found."""
+
+    graph: ImageGraph
+    warps: Warps
+    problem: Problem
+    solved: Solved
+    refined: Refined | None
+    surfaces: Surfaces
+    conformal_scale: np.ndarray
+    """(E, P) on the edges of the graph, NaN where a pair was not observed."""
+    bending: float
+    """Bending weight of the splines that give the surfaces' terms."""
+
+
 @threadpool_limits.wrap(limits=1, user_api="blas")
 def reconstruct(
     tracks: Tracks, config: Config | None = None, progress: Progress | None = None
@@ -88,6 +108,24 @@ def reconstruct(
     """
     config = config or Config()
     progress = progress or Progress()
+    keys = np.arange(tracks.n_frames)
+    if config.refinement:
+        keys = choose_keyframes(tracks.visible, config.keyframes, config.graph.min_shared)
+    joint = reconstruct_jointly(tracks.select(frames=keys), config, progress)
+    others: list[tuple[np.ndarray, Others]] = []
+    rest = np.setdiff1d(np.arange(tracks.n_frames), keys)
+    if len(rest):
+        guide = make_guide(tracks.select(frames=keys), joint, config)
+        with progress.stage("other images"):
+            for first in range(0, len(rest), BLOCK):
+                part = tracks.select(frames=rest[first : first + BLOCK])
+                others.append((rest[first : first + BLOCK], reconstruct_others(guide, part.normalised(), part.visible)))
+                progress.update(min(first + BLOCK, len(rest)), len(rest))
+    return _gathered(tracks, keys, joint, others), _record(tracks, config, keys, joint, others, progress)
+
+
+def reconstruct_jointly(tracks: Tracks, config: Config, progress: Progress) -> Joint:
+    """All stages, of all images together; arguments and errors as for `reconstruct`."""
     image, visible = tracks.normalised(), tracks.visible
     with progress.stage("image graph"):
         graph = select_edges(visible, config.graph, image)
@@ -108,13 +146,35 @@ def reconstruct(
             log_depth = np.where(visible, solved.state.log_depth.T, np.nan)
             refined = refine(image, visible, log_depth, config.refine, sigma, progress.update)
     with progress.stage("surfaces"):
-        result = _surfaces(tracks, graph, problem, solved, refined)
-    return result, _record(tracks, config, graph, warps, problem, solved, refined, progress)
+        if refined is None:
+            surfaces, bending = surfaces_of_terms(problem, solved), solved.integrated.bending
+        else:
+            constrained = problem.constrained().T & visible
+            surfaces, bending = surfaces_of_points(refined, constrained, problem.camera)
+        conformal_scale = scales(problem, surfaces.frame())
+    return Joint(graph, warps, problem, solved, refined, surfaces, conformal_scale, bending)
 
 
 def make_backend(name: str) -> Backend:
     """The solver of the point-wise problem by name."""
     return GtsamBackend() if name == "gtsam" else BatchedBackend()
+
+
+def make_guide(tracks: Tracks, joint: Joint, config: Config) -> Guide:
+    """What other images need of keyframes that were reconstructed and refined jointly."""
+    if joint.refined is None:
+        raise ValueError("other images follow refined keyframes only")
+    return Guide(
+        image=np.where(tracks.visible[..., None], tracks.normalised(), 0.0),
+        visible=tracks.visible,
+        surfaces=joint.surfaces,
+        reference=joint.refined.reference,
+        bending=joint.bending,
+        warps=joint.warps.config,
+        refine=config.refine,
+        min_shared=config.graph.min_shared,
+        camera=joint.problem.camera,
+    )
 
 
 def _refuse_unrelated(problem: Problem, warps: Warps) -> None:
@@ -128,78 +188,66 @@ def _refuse_unrelated(problem: Problem, warps: Warps) -> None:
         )
 
 
-def _surfaces(
-    tracks: Tracks, graph: ImageGraph, problem: Problem, solved: Solved, refined: Refined | None
+def _gathered(
+    tracks: Tracks, keys: np.ndarray, joint: Joint, others: Sequence[tuple[np.ndarray, Others]]
 ) -> Reconstruction:
-    """Gather the last stage's surfaces; terms and scales always belong to the points that are returned."""
-    visible = tracks.visible
-    if refined is None:
-        image, state = np.moveaxis(problem.image, 0, 1), solved.state
-        log_depth = state.log_depth.T
-        points = PERSPECTIVE.points(image, np.exp(log_depth))
-        first, second = np.moveaxis(state.first_order, 0, 1), np.moveaxis(state.second_order, 0, 1)
-        recovered, depth_std = visible, np.full(visible.shape, np.nan)
-        log_factor, outlier = np.full(visible.shape, np.nan), np.zeros(visible.shape, dtype=bool)
-        # Points without a usable pair lie on the surface through the others.
-        bare = ~problem.constrained().T
-        first = np.where(bare[..., None], np.moveaxis(solved.integrated.first_order, 0, 1), first)
-        second = np.where(bare[..., None], np.moveaxis(solved.integrated.second_order, 0, 1), second)
-    else:
-        points, log_depth = refined.points, refined.log_depth
-        recovered = np.isfinite(points).all(axis=-1)
-        if not (points[recovered][:, 2] > 0).all():
-            raise ComputationError("the refinement left points without depth; check the tracks for gross errors")
-        image = np.where(recovered[..., None], points[..., :2] / points[..., 2:], 0.0)
-        first, second = terms_of_depth(image, log_depth, recovered, problem.camera)
-        depth_std, log_factor, outlier = refined.depth_std, refined.log_factor, refined.outlier
-    if not recovered.any() or not np.isfinite(points[recovered]).all():
-        raise ComputationError("the reconstruction holds no finite surface; check the tracks for gross errors")
-    frame = np.concatenate([first, second, np.where(recovered, log_depth, 0.0)[..., None]], axis=-1)
-    scaled = with_closed_form_scale(
-        problem, State(np.ascontiguousarray(frame.transpose(1, 0, 2)), solved.state.log_scale), METRIC_ONLY
-    )
-    seen = recovered[..., None]
+    """Keyframes and other images in the order of the sequence."""
+    parts = [(keys, joint.surfaces), *((frames, other.surfaces) for frames, other in others)]
+    order = np.argsort(np.concatenate([frames for frames, _ in parts]))
+
+    def gathered(name: str) -> np.ndarray:
+        return np.concatenate([getattr(surfaces, name) for _, surfaces in parts])[order]
+
+    edges = [keys[joint.graph.edges]]
+    edges += [np.sort(np.stack([keys[other.keyframe], frames], axis=1), axis=1) for frames, other in others]
+    scale = [joint.conformal_scale]
+    for frames, other in others:  # edges run from the lower image to the higher
+        backwards = (frames < keys[other.keyframe])[:, None]
+        scale.append(np.where(backwards, 1.0 / other.conformal_scale, other.conformal_scale))
+    ambiguous = gathered("ambiguous")
     return Reconstruction(
         pixels=tracks.pixels,
         K=tracks.K,
-        visible=visible,
-        points=np.where(seen, points, np.nan),
-        normals=np.where(seen, normals(image, first), np.nan),
-        depth=np.where(recovered, points[..., 2], np.nan),
-        first_order=np.where(seen, first, np.nan),
-        second_order=np.where(seen, second, np.nan),
-        edges=graph.edges,
-        edge_weight=graph.weight,
-        conformal_scale=np.where(problem.weight > 0, np.exp(scaled.log_scale), np.nan).T,
-        depth_std=np.where(recovered, depth_std, np.nan),
-        log_factor=log_factor,
-        interpolated=recovered & ~(problem.constrained().T & visible),
-        outlier=outlier,
+        visible=tracks.visible,
+        points=gathered("points"),
+        normals=gathered("normals"),
+        depth=gathered("depth"),
+        first_order=gathered("first_order"),
+        second_order=gathered("second_order"),
+        edges=np.concatenate(edges),
+        edge_weight=np.concatenate([joint.graph.weight, *(other.edge_weight for _, other in others)]),
+        conformal_scale=np.concatenate(scale),
+        depth_std=gathered("depth_std"),
+        log_factor=gathered("log_factor"),
+        interpolated=gathered("interpolated"),
+        outlier=gathered("outlier"),
         image_names=None if tracks.image_names is None else np.asarray(tracks.image_names),
-        ambiguous=None if refined is None or refined.alternative is None else refined.ambiguous,
-        alternative=None if refined is None else refined.alternative,
+        ambiguous=None if joint.surfaces.alternative is None else ambiguous,
+        alternative=None if joint.surfaces.alternative is None else gathered("alternative"),
     )
 
 
 def _record(
     tracks: Tracks,
     config: Config,
-    graph: ImageGraph,
-    warps: Warps,
-    problem: Problem,
-    solved: Solved,
-    refined: Refined | None,
+    keys: np.ndarray,
+    joint: Joint,
+    others: Sequence[tuple[np.ndarray, Others]],
     progress: Progress,
 ) -> RunRecord:
-    reports = zip(warps.edges, warps.reports, strict=True)
-    problems = [(edge, report.problem) for edge, report in reports if report.problem]
+    graph, warps, solved, refined = joint.graph, joint.warps, joint.solved, joint.refined
+    reports = zip(keys[warps.edges], warps.reports, strict=True)
+    problems = [((a, b), report.problem) for (a, b), report in reports if report.problem]
+    for frames, other in others:
+        ends = zip(keys[other.keyframe], frames, other.problem, strict=True)
+        problems += [((a, b), problem) for a, b, problem in ends if problem]
     warnings = [f"warp from image {a} to image {b}: {problem}" for (a, b), problem in problems[:5]]
     if len(problems) > 5:
         warnings.append(f"{len(problems) - 5} more warps had problems")
     cycles = cycle_agreement(warps)
     suspects = cycles.suspects()
     if len(suspects):
-        pairs = ", ".join(f"{a}-{b}" for a, b in warps.edges[suspects[:5]])
+        pairs = ", ".join(f"{a}-{b}" for a, b in keys[warps.edges[suspects[:5]]])
         warnings.append(f"{len(suspects)} warps disagree with the others around cycles of the image graph ({pairs})")
     spread = float(np.nanmedian(np.nanstd(tracks.pixels, axis=1)))
     if (misfit := (_median(warps.residual) or 0.0) * tracks.focal_length()) > NOISY * spread:
@@ -209,6 +257,7 @@ def _record(
         )
     decisions: dict[str, Any] = {
         "warp model": sorted({report.model for report in warps.reports}),
+        "keyframes": {"jointly": len(keys), "following": tracks.n_frames - len(keys)},
         "edges": {"tree": graph.n_tree, "extra": len(graph.edges) - graph.n_tree},
         "disagreement of warps around triangles (median)": _median(cycles.disagreement),
         "warp residual in pixels (median)": (_median(warps.residual) or 0.0) * tracks.focal_length(),

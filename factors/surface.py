@@ -46,6 +46,11 @@ class Camera:
             return np.concatenate([image * depth, depth], axis=-1)
         return np.concatenate([np.broadcast_to(image, (*depth.shape[:-1], 2)), depth], axis=-1)
 
+    def image(self, points: np.ndarray) -> np.ndarray:
+        """Normalised image coordinates (..., 2) of surface points in the camera frame."""
+        points = np.asarray(points, dtype=float)
+        return points[..., :2] / points[..., 2:] if self.kappa else points[..., :2].copy()
+
 
 PERSPECTIVE = Camera("perspective", 1.0)
 ORTHOGRAPHIC = Camera("orthographic", 0.0)

@@ -48,7 +48,7 @@ def outcome(
     log_depth = np.where(known, log_depth, 0.0)
     frames = known.any(axis=1)
     first, second = np.zeros((*known.shape, 2)), np.zeros((*known.shape, 3))
-    first[frames], second[frames] = terms_of_depth(image[frames], log_depth[frames], known[frames], PERSPECTIVE)
+    first[frames], second[frames], _ = terms_of_depth(image[frames], log_depth[frames], known[frames], PERSPECTIVE)
     seen = known[..., None]
     points = np.where(seen, PERSPECTIVE.points(image, np.exp(log_depth)), np.nan)
     nothing = np.full(known.shape, np.nan)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -43,11 +44,13 @@ class RefineConfig:
         if self.model not in get_args(Model):
             raise InputError(f"refine.model is '{self.model}', expected one of {', '.join(get_args(Model))}")
         for name in ("length_sigma", "factor_sigma", "bending_sigma"):
-            if not getattr(self, name) > 0.0:
+            if not 0.0 < getattr(self, name) < math.inf:
                 raise InputError(f"refine.{name} is {getattr(self, name)}, expected a positive number")
         if self.rings not in (1, 2):
             raise InputError(f"refine.rings is {self.rings}, expected 1 or 2")
-        if self.iterations < 1 or self.tolerance < 0.0:
-            raise InputError("refine.iterations must be at least 1 and refine.tolerance at least 0")
+        if self.iterations < 1:
+            raise InputError(f"refine.iterations is {self.iterations}, expected at least 1")
+        if not 0.0 <= self.tolerance < 1.0:
+            raise InputError(f"refine.tolerance is {self.tolerance}, expected 0 or more, below 1")
         if len(self.isometric_views) == 1:
             raise InputError("refine.isometric_views names one view, expected none or at least two")

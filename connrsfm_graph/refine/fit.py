@@ -31,7 +31,7 @@ _HALVINGS = 2
 """How often the assumed length noise may be halved."""
 _RESTARTS = 4
 """Rounds of restarts in the conformal model, at most."""
-_CAUGHT = 3.0
+CAUGHT = 3.0
 """A view that costs this many times the median view may be caught in a wrong shape."""
 _MISFIT = 1.0
 """Isometry is in doubt where its squared residuals exceed this many assumed variances on average."""
@@ -149,7 +149,7 @@ def fit_isometric(task: Task, noise: Noise) -> Fit:
     measurements = task.measurements(noise)
     shape, history = _minimise(task, measurements, start_shape(task.completed, task.mesh))
     cost = costs(measurements, shape, lag(measurements, shape))
-    caught = np.flatnonzero(cost > _CAUGHT * np.median(cost))
+    caught = np.flatnonzero(cost > CAUGHT * np.median(cost))
     if len(caught):
         better, renewed = restart(measurements.views(caught), shape.views(caught))
         if renewed.any():

@@ -96,6 +96,14 @@ class Measurements:
             factor_weight=self.factor_weight[index],
         )
 
+    def replaced(self, index: np.ndarray, other: Measurements) -> Measurements:
+        """The measurements with some views taken from measurements of only these."""
+        names = ("image", "image_weight", "log_depth", "length_weight", "factor_weight")
+        parts = {name: getattr(self, name).copy() for name in names}
+        for name, part in parts.items():
+            part[index] = getattr(other, name)
+        return replace(self, **parts)
+
 
 @dataclass(frozen=True)
 class Lagged:

@@ -11,6 +11,7 @@ import numpy as np
 from connrsfm_graph.errors import InputError
 from connrsfm_graph.refine.config import RefineConfig
 from connrsfm_graph.refine.fit import Fit, Task, fit
+from connrsfm_graph.refine.follow import Reference, contradicted
 from connrsfm_graph.refine.uncertainty import log_depth_deviation
 from connrsfm_graph.refine.unseen import complete
 from connrsfm_graph.refine.wrong_tracks import wrong_tracks
@@ -51,6 +52,8 @@ class Refined:
     """What the choices rest on."""
     cost_history: tuple[float, ...]
     """Cost at the start and after every iteration; starts anew where the assumed noise or the start changed."""
+    reference: Reference
+    """What further views need to follow these."""
     warnings: tuple[str, ...] = ()
     """One sentence each."""
 
@@ -86,13 +89,14 @@ def refine(
         completed = complete(image[:, used], seen, np.where(outlier, np.nan, log_depth)[:, used])
         found = fit(Task.of(completed, seen, config), sigma_image)
         late = np.zeros_like(visible)
-        late[:, used] = _contradicted(found, seen)
+        reference = Reference(found, completed.template, seen, used)
+        late[:, used] = contradicted(found.shape.correction, seen, reference.gross())
         if not config.outliers or not late.any():
             break
         outlier |= late
     if progress is not None:
         progress(_ATTEMPTS, _ATTEMPTS)
-    return _refined(found, config, seen, used, outlier)
+    return _refined(found, config, reference, outlier)
 
 
 def _checked(
@@ -115,19 +119,8 @@ def _checked(
     return np.where(visible[..., None], image, 0.0), visible, log_depth
 
 
-def _contradicted(found: Fit, seen: np.ndarray) -> np.ndarray:
-    """(F, P) bool, seen points whose ray correction is beyond all noise."""
-    size = np.linalg.norm(found.shape.correction, axis=-1)
-    return seen & (size > found.noise.gross(size[seen]))
-
-
-def _refined(found: Fit, config: RefineConfig, seen: np.ndarray, used: np.ndarray, outlier: np.ndarray) -> Refined:
-    def all_points(values: np.ndarray) -> np.ndarray:
-        full = np.full((len(values), len(used), *values.shape[2:]), np.nan)
-        full[:, used] = values
-        return full
-
-    image, shape = found.measurements.image, found.shape
+def _refined(found: Fit, config: RefineConfig, reference: Reference, outlier: np.ndarray) -> Refined:
+    image, shape, seen, all_points = found.measurements.image, found.shape, reference.seen, reference.all_points
     deviation = np.full(seen.shape, np.nan)
     if config.uncertainty:
         deviation = log_depth_deviation(found.measurements, shape, stretch=not found.noisy)
@@ -145,12 +138,13 @@ def _refined(found: Fit, config: RefineConfig, seen: np.ndarray, used: np.ndarra
         ray_correction=all_points(np.where(seen[..., None], shape.correction, np.nan)),
         log_factor=all_points(shape.log_factor if found.conformal else np.zeros_like(shape.log_depth)),
         log_length=shape.log_length,
-        mesh_edges=np.flatnonzero(used)[found.measurements.mesh.edges],
+        mesh_edges=np.flatnonzero(reference.used)[found.measurements.mesh.edges],
         outlier=outlier,
         model="conformal" if found.conformal else "isometric",
         ambiguous=group,
         alternative=None if found.alternative is None else all_points(found.alternative.points(image)),
         evidence=found.evidence,
         cost_history=tuple(found.history),
+        reference=reference,
         warnings=tuple(warnings),
     )

@@ -32,7 +32,8 @@ def start_mesh(completed: Completed, visible: np.ndarray, rings: int) -> Mesh:
         chords = log_chords(points, edges)
         return np.median(chords - np.median(chords, axis=1, keepdims=True), axis=0)
 
-    square = ((completed.template[:, None] - completed.template[None]) ** 2).sum(axis=-1)
+    position = completed.template.position
+    square = ((position[:, None] - position[None]) ** 2).sum(axis=-1)
     neighbours = np.argsort(square, axis=1, kind="stable")[:, 1 : 1 + _NEIGHBOURS]
     pairs = np.stack([np.repeat(np.arange(len(square)), neighbours.shape[1]), neighbours.ravel()], axis=1)
     flat = np.concatenate([completed.image, np.ones_like(completed.image[..., :1])], axis=-1)

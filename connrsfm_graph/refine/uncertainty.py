@@ -22,17 +22,22 @@ _SMOOTHINGS = 4
 """Averages over neighbours that make independent noise a stretch of the surface."""
 
 
-def log_depth_deviation(measurements: Measurements, shape: Shape, stretch: bool, seed: int = 0) -> np.ndarray:
+def log_depth_deviation(
+    measurements: Measurements, shape: Shape, stretch: bool, jointly: bool = True, seed: int = 0
+) -> np.ndarray:
     """(F, P) standard deviation of log depth, the scale common to all views left out.
 
     Args:
         measurements: with the noise levels of the fit.
         shape: minimum of the cost.
         stretch: whether lengths vary alike for neighbours.
+        jointly: whether the views were fitted together with the lengths. Else the lengths are taken as known, views do
+            not depend on each other, and all have the same draws.
         seed: of the draws.
     """
     rng = np.random.default_rng(seed)
     F, P = shape.log_depth.shape
+    drawn = F if jointly else 1
     envelope = measurements.envelope(shape.log_factor.size > 0)
     equations, _ = linearise(measurements, shape, lag(measurements, shape), envelope)
     factorised = Factorised(equations, envelope, measurements.mesh.edges)
@@ -40,16 +45,19 @@ def log_depth_deviation(measurements: Measurements, shape: Shape, stretch: bool,
     edges = measurements.mesh.edges
     variance = np.zeros((F, P))
     for _ in range(_SAMPLES):
-        noise = rng.standard_normal((F, len(edges))) / measurements.length_weight
+        noise = rng.standard_normal((drawn, len(edges))) / measurements.length_weight
         if stretch:
-            field = rng.standard_normal((F, P))
+            field = rng.standard_normal((drawn, P))
             for _ in range(_SMOOTHINGS):
                 field = _around(field, measurements.mesh)
             field /= field.std()
             noise = 0.5 * (field[:, edges[:, 0]] + field[:, edges[:, 1]]) / measurements.length_weight
         gradient = -factorised.spread(noise)
-        gradient[:, rays] += measurements.image_weight[..., None] * rng.standard_normal((F, P, 2))
-        views, _ = factorised.solve(gradient, -(equations.weight * noise).sum(axis=0), _TOLERANCE)
+        gradient[:, rays] += measurements.image_weight[..., None] * rng.standard_normal((drawn, P, 2))
+        if jointly:
+            views, _ = factorised.solve(gradient, -(equations.weight * noise).sum(axis=0), _TOLERANCE)
+        else:
+            views = factorised.solve_views(gradient)
         variance += views[:, envelope.unknown] ** 2 / _SAMPLES
     # Variances vary slowly over the surface, their estimates from a few draws do not.
     return np.asarray(np.sqrt(_around(variance, measurements.mesh)))

@@ -15,11 +15,21 @@ from connrsfm_graph.refine.thin_plate import fit_thin_plate
 
 
 @dataclass(frozen=True)
+class Template:
+    """All points on one plane."""
+
+    position: np.ndarray
+    """(P, 2) about the image of the view that sees most."""
+    deviation: np.ndarray
+    """(P,) standard deviation of a coordinate; 0 for the points of that view."""
+
+
+@dataclass(frozen=True)
 class Completed:
     """Views with values at all points."""
 
-    template: np.ndarray
-    """(P, 2) all points on one plane, about the image of the view that sees most."""
+    template: Template
+    """All points on one plane."""
     image: np.ndarray
     """(F, P, 2) image points, interpolated where not seen."""
     log_depth: np.ndarray
@@ -28,36 +38,43 @@ class Completed:
     """(F, P) standard deviation of a coordinate of the interpolated image points, 0 where seen."""
 
 
-def complete(image: np.ndarray, visible: np.ndarray, log_depth: np.ndarray) -> Completed:
+def complete(
+    image: np.ndarray, visible: np.ndarray, log_depth: np.ndarray, template: Template | None = None
+) -> Completed:
     """Interpolate what was not seen.
 
     Args:
         image: (F, P, 2) normalised coordinates, any value where not visible.
         visible: (F, P) bool; every point in some view, every view with some point.
         log_depth: (F, P); where a visible one is NaN it is interpolated as well.
+        template: of all points; made from these views where None.
     """
-    template, uncertainty = make_template(image, visible)
+    template = template or make_template(image, visible)
     known = visible & np.isfinite(log_depth)
-    image, log_depth, deviation = image.copy(), log_depth.copy(), np.zeros(visible.shape)
-    for f, seen in enumerate(visible):
-        if not seen.all():
-            warp = fit_thin_plate(template[seen], image[f, seen])
-            image[f, ~seen] = warp(template[~seen])
-            deviation[f, ~seen] = np.hypot(warp.deviation(template[~seen]), uncertainty[~seen])
+    log_depth = log_depth.copy()
+    for f in range(len(visible)):
         if not known[f].any():
             raise InputError(f"refinement: image {f} has no point with a depth to start from")
         if not known[f].all():
-            surface = fit_thin_plate(template[known[f]], log_depth[f, known[f], None])
-            log_depth[f, ~known[f]] = surface(template[~known[f]])[:, 0]
+            surface = fit_thin_plate(template.position[known[f]], log_depth[f, known[f], None])
+            log_depth[f, ~known[f]] = surface(template.position[~known[f]])[:, 0]
+    image, deviation = complete_images(image, visible, template)
     return Completed(template, image, log_depth, deviation)
 
 
-def make_template(image: np.ndarray, visible: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """All points on the image plane of the view that sees most, other views warped onto it one by one.
+def complete_images(image: np.ndarray, visible: np.ndarray, template: Template) -> tuple[np.ndarray, np.ndarray]:
+    """Image points (F, P, 2) with those not seen interpolated, and the (F, P) deviations of these."""
+    image, deviation, position = image.copy(), np.zeros(visible.shape), template.position
+    for f, seen in enumerate(visible):
+        if not seen.all():
+            warp = fit_thin_plate(position[seen], image[f, seen])
+            image[f, ~seen] = warp(position[~seen])
+            deviation[f, ~seen] = np.hypot(warp.deviation(position[~seen]), template.deviation[~seen])
+    return image, deviation
 
-    Returns:
-        (P, 2) positions and the (P,) standard deviation of their coordinates.
-    """
+
+def make_template(image: np.ndarray, visible: np.ndarray) -> Template:
+    """All points on the image plane of the view that sees most, other views warped onto it one by one."""
     base = int(visible.sum(axis=1).argmax())
     template, known = np.where(visible[base, :, None], image[base], 0.0), visible[base].copy()
     deviation = np.zeros(len(template))
@@ -73,4 +90,4 @@ def make_template(image: np.ndarray, visible: np.ndarray) -> tuple[np.ndarray, n
         warp = fit_thin_plate(image[view, common], template[common])
         template[new], deviation[new] = warp(image[view, new]), warp.deviation(image[view, new])
         known |= new
-    return template, deviation
+    return Template(template, deviation)

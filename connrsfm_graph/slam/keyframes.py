@@ -118,7 +118,7 @@ class Keyframes:
         problem = make_problem(local.image, local.seen, edges, warps.jets, warps.weight * warps.valid)
         if not (problem.weight > 0).any():
             raise InputError("no pair of the view with a keyframe is usable")
-        first, second = terms_of_depth(local.image, local.log_depth, local.seen, problem.camera)
+        first, second, _ = terms_of_depth(local.image, local.log_depth, local.seen, problem.camera)
         state = flat_state(problem).updated(
             first_order=np.swapaxes(first, 0, 1), second_order=np.swapaxes(second, 0, 1)
         )

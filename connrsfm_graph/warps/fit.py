@@ -11,7 +11,7 @@ from connrsfm_graph.errors import InputError
 from connrsfm_graph.warps.config import WarpConfig
 from connrsfm_graph.warps.fitted import FittedWarp
 from connrsfm_graph.warps.normalise import LocalCoordinates, jet_from_local
-from connrsfm_graph.warps.select import Probe, fit_model, fit_process, resolve
+from connrsfm_graph.warps.select import Probe, fit_model, fit_process, is_resolved, resolve
 from factors.warp_jet import JET_SIZE, WarpJet
 
 # Points whose second principal spread is below this fraction of the first lie on a line.
@@ -100,7 +100,8 @@ def fit_warps(
     valid, weight = np.zeros((E, P), dtype=bool), np.zeros((E, P))
     noise, residual = np.full(E, np.nan), np.full(E, np.nan)
     reports = []
-    config = resolve(config, _probes(image, visible, edges, config))
+    if not is_resolved(config):
+        config = resolve(config, _probes(image, visible, edges, config))
     for e, (a, b) in enumerate(edges):
         shared = np.flatnonzero(visible[a] & visible[b])
         problem = _problem(image[a, shared], image[b, shared], config)

@@ -49,6 +49,11 @@ def resolve(config: WarpConfig, probes: Sequence[Probe]) -> WarpConfig:
     return config
 
 
+def is_resolved(config: WarpConfig) -> bool:
+    """Whether the configuration leaves nothing to be chosen."""
+    return config.model == "gaussian_process" or (config.model != "auto" and getattr(config, config.model) is not None)
+
+
 def fit_process(config: WarpConfig, points: np.ndarray, target: np.ndarray) -> GaussianProcessWarp:
     """The Gaussian process of one edge, in local coordinates; it also gives the weights and the noise of the points."""
     scales = length_scales(config.shortest_scale)

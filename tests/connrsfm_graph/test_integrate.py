@@ -85,7 +85,7 @@ def test_images_with_too_few_points_are_named(exact):
 
 def test_terms_of_given_depths(exact):
     scene, *_ = exact
-    first, second = terms_of_depth(scene.image, scene.log_depth, scene.tracks.visible, PERSPECTIVE)
+    first, second, _ = terms_of_depth(scene.image, scene.log_depth, scene.tracks.visible, PERSPECTIVE)
     inner = np.linalg.norm(scene.image - scene.image.mean(axis=1, keepdims=True), axis=-1) < 0.1
     assert np.abs(first - scene.first_order)[inner].max() < 0.02
     assert np.median(np.abs(second - scene.second_order)[inner]) < 0.1
