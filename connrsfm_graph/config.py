@@ -86,8 +86,8 @@ def updated(config: C, values: Mapping[str, Any], source: str = "", prefix: str 
             raise InputError(f"{source}{key}: is a group of settings; set one of {inner}")
     try:
         return replace(config, **changes)  # type: ignore[type-var]
-    except InputError:
-        raise
+    except InputError as error:
+        raise InputError(f"{source}{error}") from error
     except ValueError as error:
         raise InputError(f"{source}{prefix.rstrip('.') or 'configuration'}: {error}") from error
 

@@ -57,7 +57,13 @@ class GraphConfig:
     def __post_init__(self) -> None:
         if not 0 <= self.extra_per_frame < np.inf:
             raise InputError(f"graph.extra_per_frame is {self.extra_per_frame}, expected a number from 0")
-        for name, least in (("extra_edges", 0), ("max_extra", 0), ("min_shared", 3), ("neighbours", 1)):
+        for name, least in (
+            ("extra_edges", 0),
+            ("max_extra", 0),
+            ("min_shared", 3),
+            ("complete_up_to", 0),
+            ("neighbours", 1),
+        ):
             value = getattr(self, name)
             if value is not None and value < least:
                 raise InputError(f"graph.{name} is {value}, expected at least {least}")

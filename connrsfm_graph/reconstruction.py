@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import platform
 import sys
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -207,7 +207,7 @@ class RunRecord:
         """Read `run.json`, or the folder that holds it; keys this version does not know are ignored.
 
         Raises:
-            InputError: the file cannot be read or lacks a key.
+            InputError: the file cannot be read, lacks a key or holds something of the wrong type.
         """
         path = Path(path)
         path = path / RECORD_FILE if path.is_dir() else path
@@ -222,7 +222,57 @@ class RunRecord:
             if name not in content:
                 raise InputError(f"{path}: key '{name}' is missing; expected a {RECORD_FILE} written by 'reconstruct'")
         known = {item.name: content[item.name] for item in fields(RunRecord) if item.name in content}
-        return RunRecord(**{**known, "warnings": tuple(known.get("warnings", ()))})
+        for name, value in known.items():
+            fits, expected = _RECORD[name]
+            if not fits(value):
+                raise InputError(
+                    f"{path}: '{name}' is not {expected}; expected a {RECORD_FILE} written by 'reconstruct'"
+                )
+        record = RunRecord(**{**known, "warnings": tuple(known.get("warnings", ()))})
+        return replace(
+            record,
+            cost_history={stage: [_number(cost) for cost in costs] for stage, costs in record.cost_history.items()},
+            seconds={stage: _number(value) for stage, value in record.seconds.items()},
+            peak_memory_mib=_number(record.peak_memory_mib),
+        )
+
+
+def _number(value: float | None) -> float:
+    """A figure as it stands in JSON, where null says that it is none."""
+    return float("nan") if value is None else float(value)
+
+
+def _is_number(value: Any) -> bool:
+    return value is None or (isinstance(value, int | float) and not isinstance(value, bool))
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str)
+
+
+def _is_table(value: Any) -> bool:
+    return isinstance(value, dict)
+
+
+# What the keys of the record must hold, and how to say it.
+_RECORD: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "source": (_is_text, "a text"),
+    "method": (_is_text, "a text"),
+    "seed": (lambda value: isinstance(value, int) and not isinstance(value, bool), "a whole number"),
+    "configuration": (_is_table, "a table of settings"),
+    "decisions": (_is_table, "a table of decisions"),
+    "warnings": (lambda value: isinstance(value, list) and all(map(_is_text, value)), "a list of sentences"),
+    "cost_history": (
+        lambda value: (
+            isinstance(value, dict)
+            and all(isinstance(costs, list) and all(map(_is_number, costs)) for costs in value.values())
+        ),
+        "a table of lists of numbers",
+    ),
+    "seconds": (lambda value: isinstance(value, dict) and all(map(_is_number, value.values())), "a table of numbers"),
+    "peak_memory_mib": (_is_number, "a number"),
+    "versions": (lambda value: isinstance(value, dict) and all(map(_is_text, value.values())), "a table of texts"),
+}
 
 
 def package_versions() -> dict[str, str]:

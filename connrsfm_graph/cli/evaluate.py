@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,7 +30,11 @@ def run(arguments: argparse.Namespace) -> None:
     reconstruction = Reconstruction.load(arguments.result)
     truth = load_tracks(arguments.truth, arguments.intrinsics, reconstruction.camera.name)
     evaluation, _ = evaluated(reconstruction, truth, str(arguments.truth))
-    print(json.dumps(evaluation.to_dict(), allow_nan=False) if arguments.json else table(evaluation))
+    print(
+        json.dumps(evaluation.to_dict(), allow_nan=False)
+        if arguments.json
+        else table(evaluation, reconstruction.image_names)
+    )
 
 
 def evaluated(reconstruction: Reconstruction, truth: Tracks, source: str) -> tuple[Evaluation, np.ndarray]:
@@ -75,14 +80,16 @@ def summary(evaluation: Evaluation) -> str:
     )
 
 
-def table(evaluation: Evaluation) -> str:
-    """One row per frame and one for all."""
-    lines = [f"{'frame':>6} {'points':>7} {'e3d %':>9} {'shape deg':>10} {'RMSE 3D':>10} {'coverage %':>11}"]
+def table(evaluation: Evaluation, names: Sequence[str] | np.ndarray | None = None) -> str:
+    """One row per frame, by its name or number, and one for all."""
+    names = [str(frame["frame"]) if names is None else str(names[frame["frame"]]) for frame in evaluation.per_frame]
+    wide = max(6, *map(len, names))
+    lines = [f"{'frame':>{wide}} {'points':>7} {'e3d %':>9} {'shape deg':>10} {'RMSE 3D':>10} {'coverage %':>11}"]
     total = {**evaluation.to_dict(), "points": sum(frame["points"] for frame in evaluation.per_frame)}
-    for name, figures in [*((str(frame["frame"]), frame) for frame in evaluation.per_frame), ("all", total)]:
+    for name, figures in [*zip(names, evaluation.per_frame, strict=True), ("all", total)]:
         coverage = None if figures["coverage"] is None else 100.0 * figures["coverage"]
         lines.append(
-            f"{name:>6} {figures['points']:>7} {_cell(figures['e3d_percent'], 9, 3)} "
+            f"{name:>{wide}} {figures['points']:>7} {_cell(figures['e3d_percent'], 9, 3)} "
             f"{_cell(figures['shape_error_deg'], 10, 2)} {_cell(figures['rmse_3d'], 10, 4)} {_cell(coverage, 11, 1)}"
         )
     return "\n".join(lines)

@@ -68,8 +68,8 @@ def evaluate(
         truth: (F, P, 3) true points in the camera frame of each image; NaN where unknown.
         visible: (F, P) bool, which points count; all where absent.
         normals: (F, P, 3) the reconstruction's own unit normals towards the camera, NaN where unknown.
-        true_normals: (F, P, 3) true unit normals towards the camera, NaN where unknown; where absent they are those of
-            a spline fitted to the truth.
+        true_normals: (F, P, 3) true normals towards the camera, NaN or zero where unknown; where absent they are those
+            of a spline fitted to the truth.
         image: (F, P, 2) coordinates over which both splines are fitted; where absent each surface is taken over its
             own perspective projections. Needed for orthographic reconstructions.
 
@@ -207,6 +207,7 @@ def _project(points: np.ndarray, what: str, frame: int) -> np.ndarray:
 def _angle(normals: np.ndarray, reference: np.ndarray) -> np.ndarray:
     """Angles in degrees where both are known. atan2 keeps its accuracy near zero, where acos loses half the digits."""
     known = np.isfinite(normals).all(axis=-1) & np.isfinite(reference).all(axis=-1)
+    known &= normals.any(axis=-1) & reference.any(axis=-1)  # a vector without length has no direction
     normals, reference = normals[known], reference[known]
     sine = np.linalg.norm(np.cross(normals, reference), axis=-1)
     return np.degrees(np.arctan2(sine, (normals * reference).sum(axis=-1)))

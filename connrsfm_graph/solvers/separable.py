@@ -59,6 +59,8 @@ class SolveConfig:
             raise InputError(f"solve.outer_iterations is {self.outer_iterations}, expected at least 1")
         if self.restarts < 0:
             raise InputError(f"solve.restarts is {self.restarts}, expected 0 or more")
+        if np.isinf(self.noise.metric):
+            raise InputError("solve.noise.metric is inf, expected a positive number: metrics fix the scales")
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,8 @@ _SAME_PIXEL = 1e-6
 """Points closer than this, in pixels, are at the same place; finer than any tracker measures."""
 _THIN = 1e-4
 """Points whose spread across is less than this share of their spread along lie on a line."""
+_WILD = 1e3
+"""A point farther from the middle of its image than so many median distances is no point of the surface."""
 _STILL = 1e-8
 """Images of which less than this share of the layout changes do not differ (see `image_graph.image_change`)."""
 _COMPARISONS = 8
@@ -32,7 +34,7 @@ def check_reconstructable(tracks: Tracks, source: str = "tracks") -> tuple[Track
     """Tracks fit for a reconstruction, and a warning for everything that was hidden or looks wrong.
 
     Where several points lie at the same pixel of an image only the first stays visible there: the surface between them
-    would have no extent.
+    would have no extent. A point far outside its image, as failed trackers report, is not visible there.
 
     Args:
         tracks: any consistent tracks.
@@ -53,20 +55,21 @@ def check_reconstructable(tracks: Tracks, source: str = "tracks") -> tuple[Track
         )
     empty = np.flatnonzero(~tracks.visible.any(axis=1))
     if len(empty):
-        raise InputError(f"{source}: {_frames(empty)} shows no point at all; leave it out")
+        raise InputError(f"{source}: {_frames(tracks, empty)} shows no point at all; leave it out")
     rare = _rarely_seen(tracks, source)
     tracks, coincident = _hide_coincident(tracks)
+    tracks, wild = _hide_wild(tracks)
     counts = tracks.visible.sum(axis=1)
     poor = np.flatnonzero(counts < MIN_POINTS)
     if len(poor):
         raise InputError(
-            f"{source}: {_frames(poor)} shows {counts[poor[0]]} points, expected at least {MIN_POINTS}; leave it out "
-            "or track more points"
+            f"{source}: {_frames(tracks, poor)} shows {counts[poor[0]]} points, expected at least {MIN_POINTS}; leave "
+            "it out or track more points"
         )
     _refuse_lines(tracks, source)
     _refuse_mirrored(tracks, source)
     _refuse_still(tracks, source)
-    return tracks, (*coincident, *rare, *_odd_camera(tracks))
+    return tracks, (*coincident, *wild, *rare, *_odd_camera(tracks))
 
 
 def _hide_coincident(tracks: Tracks) -> tuple[Tracks, list[str]]:
@@ -92,12 +95,30 @@ def _hide_coincident(tracks: Tracks) -> tuple[Tracks, list[str]]:
     return replace(tracks, visible=visible, pixels=np.where(visible[..., None], tracks.pixels, np.nan)), [warning]
 
 
+def _hide_wild(tracks: Tracks) -> tuple[Tracks, list[str]]:
+    visible = tracks.visible.copy()
+    for seen, points in zip(visible, tracks.pixels, strict=True):
+        distance = np.linalg.norm(points - np.median(points[seen], axis=0), axis=1)
+        seen &= ~(distance > _WILD * np.median(distance[seen]))
+    wild = np.argwhere(tracks.visible & ~visible)
+    if not len(wild):
+        return tracks, []
+    frame, point = wild[0]
+    warning = (
+        f"{len(wild)} observations lie far outside the others of their image (the first is point {point} of "
+        f"{tracks.frame_name(frame)}, at {np.abs(tracks.pixels[frame, point]).max():.3g} pixels); they are left out"
+    )
+    return replace(tracks, visible=visible, pixels=np.where(visible[..., None], tracks.pixels, np.nan)), [warning]
+
+
 def _refuse_lines(tracks: Tracks, source: str) -> None:
     for frame in range(tracks.n_frames):
         points = tracks.pixels[frame, tracks.visible[frame]]
         spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
         if spread[1] <= _THIN * spread[0]:
-            raise InputError(f"{source}: all points of image {frame} lie on one line, expected a surface; leave it out")
+            raise InputError(
+                f"{source}: all points of {tracks.frame_name(frame)} lie on one line, expected a surface; leave it out"
+            )
 
 
 def _refuse_mirrored(tracks: Tracks, source: str) -> None:
@@ -116,8 +137,8 @@ def _refuse_mirrored(tracks: Tracks, source: str) -> None:
     mirrored = np.flatnonzero(2 * flipped > compared)
     if len(mirrored):
         raise InputError(
-            f"{source}: {_frames(mirrored)} shows the points mirrored against the other images; turn x (or y) around "
-            "there, or leave it out"
+            f"{source}: {_frames(tracks, mirrored)} shows the points mirrored against the other images; turn x (or y) "
+            "around there, or leave it out"
         )
 
 
@@ -152,6 +173,8 @@ def _rarely_seen(tracks: Tracks, source: str) -> list[str]:
 
 def _odd_camera(tracks: Tracks) -> list[str]:
     """Signs that pixels and intrinsics do not belong together."""
+    if not tracks.camera.kappa:
+        return []
     if tracks.focal_length() < 10:
         return [
             f"the focal length is {tracks.focal_length():.3g} pixels: are the tracks in normalised coordinates? "
@@ -163,7 +186,7 @@ def _odd_camera(tracks: Tracks) -> list[str]:
     return []
 
 
-def _frames(numbers: np.ndarray) -> str:
-    """``image 3``, or ``image 3 (and 2 others)``."""
+def _frames(tracks: Tracks, numbers: np.ndarray) -> str:
+    """``image 3``, or ``image 3 (and 2 others)``; by its name where it has one."""
     others = len(numbers) - 1
-    return f"image {numbers[0]}" + (f" (and {others} other{'s' if others > 1 else ''})" if others else "")
+    return tracks.frame_name(numbers[0]) + (f" (and {others} other{'s' if others > 1 else ''})" if others else "")

@@ -45,6 +45,10 @@ class Tracks:
         rays = np.einsum("fij,fpj->fpi", np.linalg.inv(self.K), homogeneous)
         return rays[..., :2] / rays[..., 2:]
 
+    def frame_name(self, frame: int) -> str:
+        """How to call an image: its name, or its number."""
+        return f"image {frame}" if self.image_names is None else self.image_names[frame]
+
     def focal_length(self) -> float:
         """Geometric mean of the focal lengths of all images, in pixels."""
         return float(np.exp(np.log(self.K[:, [0, 1], [0, 1]]).mean()))
