@@ -54,7 +54,9 @@ class Tracks:
         return float(np.exp(np.log(self.K[:, [0, 1], [0, 1]]).mean()))
 
     def select(
-        self, frames: Sequence[int] | slice = slice(None), points: Sequence[int] | slice = slice(None)
+        self,
+        frames: Sequence[int] | np.ndarray | slice = slice(None),
+        points: Sequence[int] | np.ndarray | slice = slice(None),
     ) -> Tracks:
         """The tracks of some images and points."""
 
