@@ -26,6 +26,10 @@ class DepthMethod(Protocol):
         """(H, W) depth of every pixel of image `number`, of `size` (W, H)."""
         ...
 
+    def depth_at(self, number: int, pixels: np.ndarray) -> np.ndarray:
+        """(N,) depth at places (N, 2) of image `number`."""
+        ...
+
 
 @dataclass(frozen=True)
 class Choice:

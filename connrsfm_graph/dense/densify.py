@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from connrsfm_graph.dense.choose import choose
+from connrsfm_graph.dense.choose import DepthMethod, choose
 from connrsfm_graph.dense.layout import DENSE_FOLDER, SEQUENCE_FILE, DenseFrame, DenseIndex
 from connrsfm_graph.dense.region import surface_region
 from connrsfm_graph.dense.sparse import SparsePoints
@@ -59,61 +59,37 @@ def densify(
     if not usable:
         most = max(map(len, sparse))
         raise InputError(f"no image has {FEWEST_POINTS} recovered points (the most are {most}), too few for a surface")
-    scale = png_scale(1.5 * max(float(sparse[f].depth.max()) for f in usable))
     choice = choose([sparse[f] for f in usable], method, checkpoint)
-    frames: list[DenseFrame] = []
-    skipped, warnings = [], list(choice.warnings)
-    coarse: list[tuple[TexturedMesh, bytes, str]] = []
-    size = (0, 0)
     with folder_written_beside(out) as part:
         folder = part / DENSE_FOLDER
-        folder.mkdir()
+        writer = _Writer(folder, png_scale(1.5 * max(float(sparse[f].depth.max()) for f in usable)))
+        skipped, warnings = [], list(choice.warnings)
+        size = (0, 0)
         for f, image in enumerate(_images_of(reconstruction, images)):
             points, name = sparse[f], reconstruction.frame_name(f)
             if f == 0:
                 size = image.shape[1], image.shape[0]
                 warnings += _camera_warnings(points.K, size)
             _check_inside(reconstruction, f, size, images)
-            if len(points) < FEWEST_POINTS:
-                reason_skipped = f"{len(points)} recovered points, a surface needs {FEWEST_POINTS}"
-                skipped.append({"frame": f, "name": name, "reason": reason_skipped})
-                continue
-            start = time.perf_counter()
-            depth = np.where(surface_region(points.pixels, size), choice.method.depth(usable.index(f), size), np.nan)
-            mesh = mesh_of_depth(depth, points.K)
-            if not len(mesh.triangles):
-                skipped.append({"frame": f, "name": name, "reason": "its points span no surface"})
-                continue
-            files = _write_frame(folder, f, name, depth, mesh, image, scale)
-            frames.append(
-                DenseFrame(
-                    frame=f,
-                    name=name,
-                    K=points.K.tolist(),
-                    points=len(points),
-                    covered=float(np.isfinite(depth).mean()),
-                    depth_range=[float(np.nanmin(depth)), float(np.nanmax(depth))],
-                    residual_percent=100.0 * _residual(depth, points),
-                    seconds=time.perf_counter() - start,
-                    **files,
-                )
-            )
-            coarse_mesh = mesh_of_depth(depth, points.K, default_step(depth, SEQUENCE_CELLS))
-            coarse.append((coarse_mesh, jpeg_of(image, SEQUENCE_TEXTURE), name))
+            if f not in usable:
+                problem = f"{len(points)} recovered points, a surface needs {FEWEST_POINTS}"
+            else:
+                problem = writer.add(f, name, points, choice.method, usable.index(f), image)
+            if problem is not None:
+                skipped.append({"frame": f, "name": name, "reason": problem})
             if progress is not None:
                 progress(f + 1, reconstruction.n_frames)
-        if not frames:
+        if not writer.frames:
             raise InputError("the points of no image span a surface, so that there is nothing to make dense")
-        meshes, jpegs, names = zip(*coarse, strict=True)
-        write_glb_sequence(folder / SEQUENCE_FILE, meshes, jpegs, names, SECONDS_PER_IMAGE)
+        writer.write_sequence()
         index = DenseIndex(
             method=choice.method.name,
             reason=choice.reason,
             checkpoint=choice.checkpoint,
             size=list(size),
-            depth_png_scale=scale,
+            depth_png_scale=writer.scale,
             sequence=SEQUENCE_FILE,
-            frames=frames,
+            frames=writer.frames,
             skipped=skipped,
             warnings=warnings,
         )
@@ -121,26 +97,68 @@ def densify(
     return index
 
 
-def _write_frame(
-    folder: Path, f: int, name: str, depth: np.ndarray, mesh: TexturedMesh, image: np.ndarray, scale: float
-) -> dict[str, str]:
-    """Write the files of one image; their names by kind."""
-    files = {
-        "depth": f"depth/{f:03d}.npy",
-        "depth_png": f"depth/{f:03d}.png",
-        "texture": f"texture/{f:03d}.jpg",
-        "glb": f"glb/{f:03d}.glb",
-        "ply": f"ply/{f:03d}.ply",
-    }
-    for file in files.values():
-        (folder / file).parent.mkdir(exist_ok=True)
-    jpeg = jpeg_of(image)
-    np.save(folder / files["depth"], depth.astype(np.float32))
-    write_depth_png(folder / files["depth_png"], depth, scale)
-    (folder / files["texture"]).write_bytes(jpeg)
-    write_glb(folder / files["glb"], mesh, jpeg, name)
-    write_ply(folder / files["ply"], mesh, image)
-    return files
+class _Writer:
+    """Writes the surfaces of one image after the other, and keeps what the index and the animation need of them."""
+
+    def __init__(self, folder: Path, scale: float) -> None:
+        self.folder = folder
+        self.scale = scale
+        self.frames: list[DenseFrame] = []
+        self._coarse: list[tuple[TexturedMesh, bytes]] = []
+
+    def add(
+        self, f: int, name: str, points: SparsePoints, method: DepthMethod, number: int, image: np.ndarray
+    ) -> str | None:
+        """Make and write the surface of image `f`, the method's image `number`; why there is none, or None."""
+        start = time.perf_counter()
+        size = image.shape[1], image.shape[0]
+        depth = np.where(surface_region(points.pixels, size), method.depth(number, size), np.nan)
+        mesh = mesh_of_depth(depth, points.K)
+        if not len(mesh.triangles):
+            return "its points span no surface"
+        residual = method.depth_at(number, points.pixels) / points.depth - 1.0
+        files = self._write(f, name, depth, mesh, image)
+        self.frames.append(
+            DenseFrame(
+                frame=f,
+                name=name,
+                K=points.K.tolist(),
+                points=len(points),
+                covered=float(np.isfinite(depth).mean()),
+                depth_range=[float(np.nanmin(depth)), float(np.nanmax(depth))],
+                residual_percent=100.0 * float(np.sqrt((residual**2).mean())),
+                seconds=time.perf_counter() - start,
+                **files,
+            )
+        )
+        coarse = mesh_of_depth(depth, points.K, default_step(depth, SEQUENCE_CELLS))
+        self._coarse.append((coarse, jpeg_of(image, SEQUENCE_TEXTURE)))
+        return None
+
+    def write_sequence(self) -> None:
+        """Write the animation of all surfaces so far."""
+        meshes, jpegs = zip(*self._coarse, strict=True)
+        names = [frame.name for frame in self.frames]
+        write_glb_sequence(self.folder / SEQUENCE_FILE, meshes, jpegs, names, SECONDS_PER_IMAGE)
+
+    def _write(self, f: int, name: str, depth: np.ndarray, mesh: TexturedMesh, image: np.ndarray) -> dict[str, str]:
+        """Write the files of one image; their names by kind."""
+        files = {
+            "depth": f"depth/{f:03d}.npy",
+            "depth_png": f"depth/{f:03d}.png",
+            "texture": f"texture/{f:03d}.jpg",
+            "glb": f"glb/{f:03d}.glb",
+            "ply": f"ply/{f:03d}.ply",
+        }
+        for file in files.values():
+            (self.folder / file).parent.mkdir(parents=True, exist_ok=True)
+        jpeg = jpeg_of(image)
+        np.save(self.folder / files["depth"], depth.astype(np.float32))
+        write_depth_png(self.folder / files["depth_png"], depth, self.scale)
+        (self.folder / files["texture"]).write_bytes(jpeg)
+        write_glb(self.folder / files["glb"], mesh, jpeg, name)
+        write_ply(self.folder / files["ply"], mesh, image)
+        return files
 
 
 def _images_of(reconstruction: Reconstruction, source: Source) -> Iterator[np.ndarray]:
@@ -183,10 +201,3 @@ def _camera_warnings(K: np.ndarray, size: tuple[int, int]) -> list[str]:
         f"the camera's axis meets the image at {middle[0]:.0%} of its width and {middle[1]:.0%} of its height: check "
         "that the images have the size that was tracked"
     ]
-
-
-def _residual(depth: np.ndarray, points: SparsePoints) -> float:
-    """Root mean square relative difference of a depth map to the sparse points, at the nearest pixels."""
-    x, y = np.round(points.pixels).astype(int).clip(0, np.array(depth.shape[::-1]) - 1).T
-    relative = depth[y, x] / points.depth - 1.0
-    return float(np.sqrt(np.nanmean(relative**2)))

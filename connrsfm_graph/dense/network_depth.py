@@ -51,6 +51,11 @@ class NetworkDepth:
         added = on_grid(correction.grid, correction.control(self.bending), x, y)
         return np.exp(self._shapes[number].on_grid(x, y) + added)
 
+    def depth_at(self, number: int, pixels: np.ndarray) -> np.ndarray:
+        """(N,) depth at places (N, 2) of an image."""
+        added = self._corrections[number].surface(pixels, self.bending)[0]
+        return np.exp(self._shapes[number].at(pixels) + added)
+
 
 def unfit(checkpoint: Checkpoint, images: Sequence[SparsePoints]) -> str | None:
     """Why the images are outside of what a checkpoint was trained on, one phrase; None where they are inside."""

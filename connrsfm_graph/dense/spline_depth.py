@@ -37,6 +37,10 @@ class SplineDepth:
         spline = self._splines[number]
         return np.exp(on_grid(spline.grid, spline.control(self.bending), np.arange(size[0]), np.arange(size[1])))
 
+    def depth_at(self, number: int, pixels: np.ndarray) -> np.ndarray:
+        """(N,) depth at places (N, 2) of an image."""
+        return np.exp(self._splines[number].surface(pixels, self.bending)[0])
+
 
 def log_depth_spline(pixels: np.ndarray, log_depth: np.ndarray, control_points: int = CONTROL_POINTS) -> SurfaceSpline:
     """Spline fitted to log depths (N,) at places (N, 2)."""
@@ -59,9 +63,9 @@ def on_grid(grid: SplineGrid, control: np.ndarray, x: np.ndarray, y: np.ndarray)
 
 
 def axis_matrix(grid: SplineGrid, axis: int, x: np.ndarray) -> np.ndarray:
-    """(M, n) weight of every control point along an axis at places x (M,)."""
-    local = (x - grid.origin[axis]) / grid.step[axis]
-    cell = np.clip(np.floor(local).astype(np.int64), 0, grid.n - 4)
+    """(M, n) weight of every control point along an axis at places x (M,); those off the grid count as its border."""
+    local = np.clip((x - grid.origin[axis]) / grid.step[axis], 0.0, grid.n - 3)
+    cell = np.minimum(local.astype(np.int64), grid.n - 4)
     matrix = np.zeros((len(x), grid.n))
     matrix[np.arange(len(x))[:, None], cell[:, None] + np.arange(4)] = axis_rows(local - cell)[:, 0]
     return matrix

@@ -1,0 +1,208 @@
+"""From sparse normals to dense depth: network against spline, and the paper's ablation of encoder and augmentation.
+
+Three tables, all mean relative errors of depth:
+
+- `simulated`: held-out surfaces of the training's kind with noise on their sparse normals, and nothing but normals. The
+  spline integrates their slopes, with the bending weight by cross-validation, as the reconstruction does; the network
+  reads their image. Both answer on the same grid; each surface is scaled so that the mean log depths agree. `constant`
+  answers with one depth.
+- `real`: every second true point of the real data sets, with normals by a spline through them, is densified as by
+  `connrsfm densify`, that is with their depths; the error is that at the other points.
+- `ablation`: every encoder trained with and without noise for the same few steps on the same surfaces.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from connrsfm_graph.dense.choose import DepthMethod
+from connrsfm_graph.dense.simulated import Batch, simulate
+from connrsfm_graph.dense.sparse import SparsePoints
+from connrsfm_graph.dense.spline_depth import SplineDepth, on_grid
+from connrsfm_graph.dense.window import grid, slopes
+from connrsfm_graph.integrate import SurfaceSpline, choose_bending
+from connrsfm_graph.metrics.surface_normals import TRUTH, surface_normals
+from connrsfm_graph.tracks import load_tracks
+from connrsfm_graph.warps.basis import U, V
+from experiments.study import Options, append_row, read_rows
+from factors.surface import PERSPECTIVE
+
+if TYPE_CHECKING:
+    from connrsfm_graph.dense.checkpoint import Checkpoint
+    from connrsfm_graph.dense.train import TrainConfig
+
+NOISE = (0.0, 0.1, 0.2)
+"""Standard deviations of the noise on the components of unit normals."""
+SIZE = 64
+FRAME = (640, 480)
+"""Pixels of the depth maps of real data, whose cameras are scaled to this width."""
+DATA = ("tshirt", "flag", "kinect_paper")
+ENCODERS = ("compact", "resnet50", "densenet169")
+AUGMENTATION = (0.25, 0.0)
+ABLATION_STEPS, ABLATION_BATCH = 150, 16
+_HELD_OUT = 2
+"""First number of the keys of these surfaces; training and its own evaluation use others."""
+_CONTROL_POINTS, _HUBER = 14, 2.0
+
+Row = dict[str, str]
+
+
+def measure(options: Options) -> None:
+    """Write dense.csv and dense.md; nothing where torch is not installed."""
+    try:
+        import torch
+    except ModuleNotFoundError:
+        print("dense: skipped, torch is not installed (pip install 'connrsfm-graph[dense]')")
+        return
+    from connrsfm_graph.dense.checkpoint import SHIPPED, Checkpoint
+
+    torch.set_num_threads(1)
+    checkpoint = Checkpoint.load(SHIPPED)
+    path = options.out / "dense.csv"
+    done = {(row["table"], row["method"], row["condition"]) for row in read_rows(path)}
+    for part in (_simulated, _real, _ablation):
+        for keys, run in part(options, checkpoint):
+            if keys not in done:
+                error, milliseconds = run()
+                figures = {"error_percent": f"{100 * error:.4g}", "milliseconds": f"{milliseconds:.3g}"}
+                append_row(path, dict(zip(("table", "method", "condition"), keys, strict=True)) | figures)
+    text = _markdown(read_rows(path))
+    (options.out / "dense.md").write_text(text, encoding="utf-8")
+    print(text)
+
+
+Runs = Iterator[tuple[tuple[str, str, str], Callable[[], tuple[float, float]]]]
+"""Keys of rows, and what measures their error and milliseconds."""
+
+
+def _simulated(options: Options, checkpoint: Checkpoint) -> Runs:
+    methods: dict[str, Callable[[Batch], np.ndarray]] = {
+        "constant": lambda batch: np.zeros_like(batch.log_depth),
+        "spline": integrated,
+        "network": lambda batch: predicted(batch, checkpoint),
+    }
+    count = 8 if options.quick else 400
+    for (name, method), noise in product(methods.items(), NOISE):
+        yield ("simulated", name, f"noise {noise:.0%}"), partial(_held_out, method, count, noise)
+
+
+def _held_out(method: Callable[[Batch], np.ndarray], count: int, noise: float) -> tuple[float, float]:
+    """Error and milliseconds of a method on surfaces, one at a time."""
+    from connrsfm_graph.dense.train import relative_error
+
+    method(simulate(1, SIZE, (_HELD_OUT, count), (noise, noise)))
+    errors, seconds = [], []
+    for number in range(count):
+        batch = simulate(1, SIZE, (_HELD_OUT, number), (noise, noise))
+        start = time.perf_counter()
+        log_depth = method(batch)
+        seconds.append(time.perf_counter() - start)
+        errors.append(relative_error(log_depth, batch.log_depth, batch.mask))
+    return statistics.fmean(errors), 1e3 * statistics.median(seconds)
+
+
+def integrated(batch: Batch) -> np.ndarray:
+    """Log depth (1, S, S) of one surface from its sparse slopes, as `connrsfm_graph.integrate` does it."""
+    p, g = batch.p[0][batch.observed[0]], slopes(batch.m[0][batch.observed[0]])
+    spline = SurfaceSpline(p, (U, V), g, np.ones(len(p)), p, _CONTROL_POINTS, PERSPECTIVE)
+    bending = choose_bending([spline])
+    for _ in range(3):
+        spline.reweight(_HUBER * 1.4826 * float(np.median(spline.residual_norms(bending))), bending)
+    return on_grid(spline.grid, spline.control(bending), grid(SIZE), grid(SIZE))[None]
+
+
+def predicted(batch: Batch, checkpoint: Checkpoint) -> np.ndarray:
+    """Log depth (1, S, S) of one surface by the network, the image of normals included."""
+    from connrsfm_graph.dense.field import normal_images
+    from connrsfm_graph.dense.network import predict
+
+    seen = batch.observed[0]
+    images = normal_images(batch.p[:, seen], batch.m[:, seen], np.ones((1, seen.sum())), SIZE)
+    return predict(checkpoint.network, images, batch.mask)
+
+
+def _real(options: Options, checkpoint: Checkpoint) -> Runs:
+    from connrsfm_graph.dense.network_depth import NetworkDepth
+
+    methods: dict[str, Callable[[list[SparsePoints]], DepthMethod]] = {
+        "spline": SplineDepth,
+        "network": lambda images: NetworkDepth(checkpoint, images),
+    }
+    for data, (name, method) in product(DATA, methods.items()):
+        path = options.data / f"{data}.npz"
+        if path.exists() and not options.quick:
+            yield ("real", name, data), partial(_left_out, method, path)
+
+
+def _left_out(method: Callable[[list[SparsePoints]], DepthMethod], file: Path) -> tuple[float, float]:
+    """Error at every second true point, and milliseconds per image, of a method that is given the others."""
+    tracks = load_tracks(file)
+    assert tracks.points is not None, "the real data sets hold true points"
+    given, left = [], []
+    for points, camera in zip(tracks.points, tracks.K, strict=True):
+        K = np.diag([FRAME[0] / (2.0 * camera[0, 2])] * 2 + [1.0]) @ camera
+        known = points[np.isfinite(points).all(axis=1)]
+        pixels = known @ K.T
+        image = known[:, :2] / known[:, 2:]
+        normals = surface_normals(image[::2], known[::2], TRUTH)
+        given.append(SparsePoints(pixels[::2, :2] / pixels[::2, 2:], known[::2, 2], normals, K))
+        left.append((pixels[1::2, :2] / pixels[1::2, 2:], known[1::2, 2]))
+    method(given[:1])
+    start = time.perf_counter()
+    made = method(given)
+    for number in range(len(given)):
+        made.depth(number, FRAME)
+    seconds = (time.perf_counter() - start) / len(given)
+    errors = [np.abs(made.depth_at(n, pixels) / depth - 1.0).mean() for n, (pixels, depth) in enumerate(left)]
+    return float(np.mean(errors)), 1e3 * seconds
+
+
+def _ablation(options: Options, checkpoint: Checkpoint) -> Runs:
+    from connrsfm_graph.dense.train import TrainConfig
+
+    encoders, steps = (ENCODERS[:1], 2) if options.quick else (ENCODERS, ABLATION_STEPS)
+    for encoder, noise in product(encoders, AUGMENTATION):
+        config = TrainConfig(
+            variant=encoder, steps=steps, batch=ABLATION_BATCH, noise=noise, every=steps, held_out=ABLATION_BATCH * 16
+        )
+        name = f"{encoder}, {'noise' if noise else 'no noise'} in training"
+        file = options.out / f"dense_{encoder}_{noise:g}.pt"
+        for tested in (NOISE[0], NOISE[-1]):
+            yield ("ablation", name, f"noise {tested:.0%}"), partial(_trained, config, file, tested)
+
+
+def _trained(config: TrainConfig, file: Path, noise: float) -> tuple[float, float]:
+    """Error on held-out surfaces, and milliseconds per surface in batches, of a network trained now or before."""
+    from connrsfm_graph.dense.checkpoint import Checkpoint
+    from connrsfm_graph.dense.train import held_out_error, train
+
+    network = (Checkpoint.load(file) if file.exists() else train(config, file)).network
+    start = time.perf_counter()
+    error = held_out_error(network, config, noise)
+    return error, 1e3 * (time.perf_counter() - start) / config.held_out
+
+
+def _markdown(rows: list[Row]) -> str:
+    """A table per kind of measurement, a line per method and a column per condition: error and milliseconds."""
+    lines = []
+    for table in dict.fromkeys(row["table"] for row in rows):
+        own = [row for row in rows if row["table"] == table]
+        conditions = list(dict.fromkeys(row["condition"] for row in own))
+        lines += [f"### {table}: error of depth in percent (milliseconds per image)", ""]
+        lines += [f"| method | {' | '.join(conditions)} |", f"|---|{'---|' * len(conditions)}"]
+        for method in dict.fromkeys(row["method"] for row in own):
+            found = {row["condition"]: row for row in own if row["method"] == method}
+            cells = [
+                f"{found[c]['error_percent']} ({found[c]['milliseconds']})" if c in found else "" for c in conditions
+            ]
+            lines.append(f"| {method} | {' | '.join(cells)} |")
+        lines.append("")
+    return "\n".join(lines)
