@@ -11,6 +11,7 @@ from typing import Literal
 
 import numpy as np
 
+from connrsfm_graph.orthographic import initialise_orthographic
 from connrsfm_graph.problem import Problem, State, flat_state, planar_state
 from connrsfm_graph.solvers.interface import Backend, Levenberg, PairModel
 from factors.conformal_scale import closed_form_log_rho
@@ -34,6 +35,8 @@ def initialise(
             terms to 0, to 1, or to random numbers between -1 and 1.
         seed: of the random numbers.
     """
+    if start == "pre-step" and not problem.camera.kappa:
+        return initialise_orthographic(problem, backend, settings)
     if start == "pre-step":
         minimum = backend.minimise(
             problem, flat_state(problem), ("d",), PairNoise(), model=PairModel.ISOMETRIC, settings=settings
@@ -44,7 +47,12 @@ def initialise(
     else:
         first_order = np.full((*problem.visible.shape, 2), float(start == "ones"))
     state = planar_state(problem, first_order)
-    return with_closed_form_scale(problem, state, PairNoise(extrinsic=np.inf))
+    return with_pair_scale(problem, state, PairNoise(extrinsic=np.inf))
+
+
+def with_pair_scale(problem: Problem, state: State, noise: PairNoise) -> State:
+    """As the solve sees scales: in closed form, or known where the camera is orthographic."""
+    return with_closed_form_scale(problem, state, noise) if problem.camera.kappa else state
 
 
 def with_closed_form_scale(problem: Problem, state: State, noise: PairNoise) -> State:

@@ -17,6 +17,7 @@ Distance does not show, so there is no perspective to tell slopes apart. What re
 from __future__ import annotations
 
 import heapq
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -25,7 +26,7 @@ from scipy.spatial import cKDTree
 from connrsfm_graph.integrate import IntegrationConfig, integrate
 from connrsfm_graph.problem import Problem, State, flat_state
 from connrsfm_graph.reconstruction import Reconstruction
-from connrsfm_graph.refine import Refined
+from connrsfm_graph.refine import RefineConfig, Refined, refine
 from connrsfm_graph.solvers.interface import Backend, Levenberg, PairModel
 from connrsfm_graph.tracks import Tracks
 from factors.noise import PairNoise
@@ -201,16 +202,23 @@ def _agreeing_signs(problem: Problem, first: np.ndarray, second: np.ndarray) -> 
     return sign if bulge >= 0.0 else -sign
 
 
-def from_afar(image: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Image points and log depths of orthographic surfaces seen by a perspective camera at `DISTANCE`."""
-    return image / DISTANCE, np.log1p((depth - np.nanmean(depth, axis=1, keepdims=True)) / DISTANCE)
+def refine_from_afar(
+    image: np.ndarray,
+    visible: np.ndarray,
+    depth: np.ndarray,
+    config: RefineConfig,
+    sigma_image: float,
+    progress: Callable[[int, int], None] | None = None,
+) -> Refined:
+    """As `refine`, with depths (F, P) in place of their logarithms; the result's depths are about their mean.
 
-
-def brought_back(refined: Refined) -> Refined:
-    """Surfaces refined from afar as an orthographic camera sees them, depth about its mean; each in its image's unit.
-
-    Of a conformal model the scale of an image's unit is taken out of the factors as well.
+    Each image comes in the unit of its own image points, whatever scale the lengths shared by all asked for.
     """
+    log_depth = np.log1p((depth - np.nanmean(depth, axis=1, keepdims=True)) / DISTANCE)
+    return _brought_back(refine(image / DISTANCE, visible, log_depth, config, sigma_image / DISTANCE, progress))
+
+
+def _brought_back(refined: Refined) -> Refined:
     scale = np.nanmean(refined.points[..., 2], axis=1)[:, None] / DISTANCE
 
     def near(points: np.ndarray) -> np.ndarray:

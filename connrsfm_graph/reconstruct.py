@@ -8,8 +8,9 @@ the other images follow these in blocks.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -21,6 +22,7 @@ from connrsfm_graph.image_graph import GraphConfig, ImageGraph, select_edges
 from connrsfm_graph.initialise import Start, initialise
 from connrsfm_graph.integrate import IntegrationConfig
 from connrsfm_graph.keyframes import KeyframeConfig, choose_keyframes
+from connrsfm_graph.orthographic import in_own_unit, in_unit_of, refine_from_afar
 from connrsfm_graph.others import Guide, Others, reconstruct_others
 from connrsfm_graph.problem import Problem, make_problem
 from connrsfm_graph.progress import Progress
@@ -108,6 +110,14 @@ def reconstruct(
     """
     config = config or Config()
     progress = progress or Progress()
+    if tracks.camera.kappa:
+        return _reconstruct(tracks, config, progress)
+    scaled, unit = in_own_unit(tracks)
+    result, record = _reconstruct(scaled, orthographic_settings(config), progress)
+    return in_unit_of(tracks, result, unit), record
+
+
+def _reconstruct(tracks: Tracks, config: Config, progress: Progress) -> tuple[Reconstruction, RunRecord]:
     keys = np.arange(tracks.n_frames)
     if config.refinement:
         keys = choose_keyframes(tracks.visible, config.keyframes, config.graph.min_shared)
@@ -131,7 +141,7 @@ def reconstruct_jointly(tracks: Tracks, config: Config, progress: Progress) -> J
         graph = select_edges(visible, config.graph, image)
     with progress.stage("warps"):
         warps = fit_warps(image, visible, graph.edges, config.warps, progress.update)
-    problem = make_problem(image, visible, graph.edges, warps.jets, warps.weight * warps.valid)
+    problem = make_problem(image, visible, graph.edges, warps.jets, warps.weight * warps.valid, tracks.camera)
     _refuse_unrelated(problem, warps)
     backend = make_backend(config.solve.backend)
     with progress.stage("pre-step"):
@@ -144,7 +154,9 @@ def reconstruct_jointly(tracks: Tracks, config: Config, progress: Progress) -> J
             sigma = estimate_pixel_noise(image, visible, graph.edges)
         with progress.stage("refinement"):
             log_depth = np.where(visible, solved.state.log_depth.T, np.nan)
-            refined = refine(image, visible, log_depth, config.refine, sigma, progress.update)
+            refined = (refine if tracks.camera.kappa else refine_from_afar)(
+                image, visible, log_depth, config.refine, sigma, progress.update
+            )
     with progress.stage("surfaces"):
         if refined is None:
             surfaces, bending = surfaces_of_terms(problem, solved), solved.integrated.bending
@@ -153,6 +165,15 @@ def reconstruct_jointly(tracks: Tracks, config: Config, progress: Progress) -> J
             surfaces, bending = surfaces_of_points(refined, constrained, problem.camera)
         conformal_scale = scales(problem, surfaces.frame())
     return Joint(graph, warps, problem, solved, refined, surfaces, conformal_scale, bending)
+
+
+def orthographic_settings(config: Config) -> Config:
+    """The settings for orthographic cameras: all images jointly, and no rows that tell mirror images apart."""
+    return replace(
+        config,
+        keyframes=replace(config.keyframes, most=None),
+        solve=replace(config.solve, noise=replace(config.solve.noise, extrinsic=math.inf)),
+    )
 
 
 def make_backend(name: str) -> Backend:
@@ -224,6 +245,7 @@ def _gathered(
         image_names=None if tracks.image_names is None else np.asarray(tracks.image_names),
         ambiguous=None if joint.surfaces.alternative is None else ambiguous,
         alternative=None if joint.surfaces.alternative is None else gathered("alternative"),
+        camera=tracks.camera,
     )
 
 
@@ -271,6 +293,9 @@ def _record(
         decisions["scale convention"] = "each image is scaled so that edge lengths agree with those of all images"
         costs["refinement"] = list(refined.cost_history)
         warnings += refined.warnings
+    if not tracks.camera.kappa:
+        decisions["scale convention"] = "one unit of length for all images, as the intrinsics say"
+        decisions["mirror images"] = "second fundamental forms agree, most of the surface bulges towards the camera"
     return RunRecord(
         source="",
         method="connrsfm",

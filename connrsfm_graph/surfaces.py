@@ -65,7 +65,8 @@ def surfaces_of_terms(problem: Problem, solved: Solved) -> Surfaces:
     second = np.where(bare[..., None], np.moveaxis(solved.integrated.second_order, 0, 1), second)
     unknown = np.full(visible.shape, np.nan)
     image = np.moveaxis(problem.image, 0, 1)
-    points = problem.camera.points(image, np.exp(state.log_depth.T))
+    depth = np.exp(state.log_depth.T) if problem.camera.kappa else state.log_depth.T
+    points = problem.camera.points(image, depth)
     outlier = np.zeros_like(visible)
     return _surfaces(points, image, (first, second), visible, problem.camera, unknown, unknown, visible & bare, outlier)
 

@@ -21,7 +21,7 @@ from typing import Literal
 import numpy as np
 
 from connrsfm_graph.errors import InputError
-from connrsfm_graph.initialise import with_closed_form_scale
+from connrsfm_graph.initialise import with_pair_scale
 from connrsfm_graph.integrate import Integrated, IntegrationConfig, balance_scales, integrate
 from connrsfm_graph.problem import Problem, State
 from connrsfm_graph.solvers.interface import Backend, Levenberg, Minimum
@@ -117,7 +117,7 @@ def _restart_from_surface(
     start = minimum.state.updated(first_order=surface.first_order, second_order=surface.second_order)
     start = State(start.frame[again], start.log_scale[again])
     part = problem.points(again)
-    start = _with_scale(part, start, config.noise)
+    start = with_pair_scale(part, start, config.noise)
     trial = backend.minimise(part, start, _joint(part), config.noise, settings=config.levenberg)
     better = trial.cost < (1.0 - RESTART_GAIN) * minimum.cost[again]
     chosen = again[better]
@@ -156,11 +156,7 @@ def _separable(
 
 
 def _with_depth(problem: Problem, state: State, integrated: Integrated, noise: PairNoise) -> State:
-    return _with_scale(problem, state.updated(log_depth=integrated.log_depth), noise)
-
-
-def _with_scale(problem: Problem, state: State, noise: PairNoise) -> State:
-    return with_closed_form_scale(problem, state, noise) if problem.camera.kappa else state
+    return with_pair_scale(problem, state.updated(log_depth=integrated.log_depth), noise)
 
 
 def _joint(problem: Problem) -> tuple[str, ...]:
