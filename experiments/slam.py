@@ -8,7 +8,7 @@ compared in one world frame with
     rigid                     the same fusion in the belief that the surface does not move
     fused, odometry only      no background: minimum deformation decides
     fused                     odometry and background
-    incremental               the views one by one with a fixed lag, no background; the first 60 together
+    incremental               the views one by one with a fixed lag, no background
 
 ATE and RPE are those of the camera in the world's unit (the sheet is 2 wide, the path about 4 long), after alignment by
 rotation and translation; the surface error is the root mean square distance of map points to the truth, in the frame of
@@ -166,7 +166,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--frames", type=int, default=200)
     parser.add_argument("--points", type=int, default=150)
     parser.add_argument("--background", type=int, default=60, help="points of the background")
-    parser.add_argument("--lag", type=int, default=15, help="views the incremental fusion estimates together")
+    parser.add_argument("--lag", type=int, default=30, help="views the incremental fusion estimates together")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args(arguments)
     case = make_case(options.frames, options.points, options.background, options.seed)

@@ -5,7 +5,9 @@ so of all explanations of the images that differ by a motion of camera and surfa
 surface's points move least (in sum of squares) is the cheapest: **minimum deformation**. Every rigid landmark, prior
 or odometry factor adds its own cost to that of moving the camera, and a **rigid background decides**: its image points
 are known to a fraction of a pixel, the motion prior is worth a few per cent of the depth. It decides what it sees: the
-camera's rotation always, its translation as far as the background shows parallax.
+camera's rotation and, as far as there is parallax, its path up to a scale, which takes a length from odometry or a
+prior. The distance of the surface stays with minimum deformation: one that moves in proportion to the camera looks
+like a larger one at rest.
 """
 
 from __future__ import annotations
@@ -19,7 +21,8 @@ import numpy as np
 
 from connrsfm_graph.errors import InputError
 from connrsfm_graph.reconstruction import Reconstruction
-from connrsfm_graph.slam.sightings import FusionNoise, Sightings, View, estimate_noise
+from connrsfm_graph.slam.noise import FusionNoise, estimate_noise
+from connrsfm_graph.slam.sightings import Sightings, View
 from factors.camera_anchor import camera_anchor_factor
 from factors.keys import CAMERA_POSE, LOG_DEPTH, MAP_POINT, VIEW_SCALE, describe, key
 from factors.map_motion import map_motion_factor

@@ -8,7 +8,8 @@ import numpy as np
 from connrsfm_graph.errors import InputError
 from connrsfm_graph.metrics.alignment import align_similarity
 from connrsfm_graph.slam.assemble import pose_key
-from connrsfm_graph.slam.sightings import FusionNoise, Sightings
+from connrsfm_graph.slam.noise import FusionNoise
+from connrsfm_graph.slam.sightings import Sightings
 from factors.keys import RIGID_LANDMARK, VIEW_SCALE, key
 
 _FEWEST = 4
@@ -18,6 +19,8 @@ _RENEWAL = 0.1
 _GUESS_WEIGHT = 1.0
 """Weight of the guess of a landmark's place, in rays. Poses from odometry turn too much for their rays to be trusted:
 a start behind a camera has no way out, one at a wrong distance has."""
+STANDSTILL = 1e-9
+"""Length up to which a step of odometry is none."""
 LANDMARK_HUBER = 3.0
 """Landmarks beyond this many standard deviations of the image noise count linearly."""
 

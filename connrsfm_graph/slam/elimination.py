@@ -14,7 +14,8 @@ import numpy as np
 
 from connrsfm_graph.slam.assemble import MapModel
 from connrsfm_graph.slam.chain import factorise, solve, subtract_coupling
-from connrsfm_graph.slam.sightings import FusionNoise, Sightings
+from connrsfm_graph.slam.noise import FusionNoise
+from connrsfm_graph.slam.sightings import Sightings
 from factors.camera_anchor import DEPTH, POINT, linearise_anchors
 from factors.map_motion import motion_coefficients, motion_variance, scale_view
 

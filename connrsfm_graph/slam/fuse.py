@@ -1,11 +1,8 @@
 """Batch fusion: trajectory, scale of every view and a deforming map in one world frame.
 
-Levenberg-Marquardt over all variables by the rule of `solvers.interface`. The map is eliminated in batch
-(`elimination`), everything else - odometry, priors, rigid landmarks, factors of the user - is a GTSAM graph that GTSAM
-linearises. Both together are the graph of `assemble.add_reconstruction`, with the same minimum.
-
-The equations of cameras and other variables are dense, 7 columns per view: made for hundreds of views, and for
-landmarks by the hundred.
+Levenberg-Marquardt over all variables (`minimise`): the map on one side, odometry, priors, rigid landmarks and factors
+of the user as a GTSAM graph on the other. Both together are the graph of `assemble.add_reconstruction`, with the same
+minimum.
 
 Gauge: where no factor of one pose alone is given the first pose is held, and where no factor between poses gives a
 length the scale of the first view. See `assemble` for what decides between motion of the camera and deformation.
@@ -13,7 +10,7 @@ length the scale of the first view. See `assemble` for what decides between moti
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import gtsam
@@ -22,10 +19,13 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from connrsfm_graph.errors import ComputationError, InputError
 from connrsfm_graph.slam.assemble import MapModel, link_scales, pose_key
-from connrsfm_graph.slam.elimination import CAMERA, MapState, MapTerms, Reduced
-from connrsfm_graph.slam.sightings import FusionNoise, Sightings
+from connrsfm_graph.slam.cameras import STANDSTILL
+from connrsfm_graph.slam.elimination import CAMERA, MapState, MapTerms
+from connrsfm_graph.slam.minimise import Columns, camera_arrays, joined, minimise
+from connrsfm_graph.slam.noise import FusionNoise
+from connrsfm_graph.slam.sightings import Sightings
 from connrsfm_graph.solvers.gtsam_backend import levenberg_marquardt
-from connrsfm_graph.solvers.interface import MAX_DAMPING, MIN_DAMPING, Levenberg
+from connrsfm_graph.solvers.interface import Levenberg
 from factors.keys import CAMERA_POSE, LOG_DEPTH, MAP_POINT, VIEW_SCALE, decode, describe, key
 
 GAUGE_SIGMA = 1e-6
@@ -38,8 +38,8 @@ class FusionConfig:
 
     map: MapModel = field(default_factory=MapModel)
     """How the map moves."""
-    levenberg: Levenberg = field(default_factory=lambda: Levenberg(max_iterations=50))
-    """Settings of the minimisation."""
+    levenberg: Levenberg = field(default_factory=lambda: Levenberg(max_iterations=50, tolerance=1e-6))
+    """Settings of the minimisation: a trajectory's slowest modes, its drift and scale, hardly change the cost."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ def fuse(
     values: gtsam.Values,
     config: FusionConfig | None = None,
     progress: Callable[[int, int], None] | None = None,
-    settle: bool = True,
+    estimate: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Fused:
     """Fuse a reconstruction with what is known about the cameras.
 
@@ -94,7 +94,8 @@ def fuse(
         values: start of the poses of all views and of the graph's other variables; scales start at 0 unless given.
         config: settings.
         progress: called with (accepted steps, most steps).
-        settle: minimise over the given factors alone first; not where the cameras start from an estimate with the map.
+        estimate: log depths (F, P) and map points (F, P, 3) to start from, where `values` belong to them; else the
+            cameras start at the minimum of the given factors alone and the map from the measured depths.
 
     Raises:
         InputError: a view sees nothing and no factor holds it, a pose or variable has no start, the graph holds
@@ -105,141 +106,16 @@ def fuse(
     rest = _with_gauge(graph, values, sightings, noise)
     cameras = [k for view in range(sightings.n_views) for k in (pose_key(view), key(VIEW_SCALE, 0, view))]
     start = _start_values(rest, values, cameras)
-    if settle:  # a landmark that cameras turn away from must not pull at the surface
-        start, _, _ = levenberg_marquardt(rest, start, config.levenberg)
     terms = MapTerms(sightings, noise, config.map)
-    state = terms.start(*camera_arrays(start, range(sightings.n_views)))
+    if estimate is None:  # a landmark that cameras turn away from must not pull at the surface
+        start, _, _ = levenberg_marquardt(rest, start, config.levenberg)
+        state = terms.start(*camera_arrays(start, range(sightings.n_views)))
+    else:
+        log_depth, points = (array[terms.view, terms.point] for array in estimate)
+        state = MapState(*camera_arrays(start, range(sightings.n_views)), log_depth, points)
     columns = Columns(rest, start, cameras)
     state, start, history = minimise(terms, state, rest, start, columns, config.levenberg, progress)
     return _fused(terms, sightings, state, start, rest, columns, cameras, history)
-
-
-def minimise(
-    terms: MapTerms,
-    state: MapState,
-    rest: gtsam.NonlinearFactorGraph,
-    values: gtsam.Values,
-    columns: Columns,
-    settings: Levenberg,
-    progress: Callable[[int, int], None] | None = None,
-) -> tuple[MapState, gtsam.Values, list[float]]:
-    """Levenberg-Marquardt over the map and the free variables of the rest of the graph.
-
-    Returns:
-        Map, values and the costs at the start and after every accepted step.
-
-    Raises:
-        InputError: the cost at the start is not a number.
-    """
-    cost = terms.cost(state) + rest.error(values)
-    if not np.isfinite(cost):
-        raise InputError("fusion: the cost at the start is not a number; check poses and measurements")
-    history, damping = [cost], settings.damping
-    while len(history) <= settings.max_iterations:
-        hessian, gradient = columns.normal_equations(rest.linearize(values))
-        while True:
-            try:
-                next_state, next_values = _step(terms, state, values, columns, hessian, gradient, damping)
-                new = terms.cost(next_state) + rest.error(next_values)
-            except (LinAlgError, RuntimeError, ValueError):  # indeterminate, or a residual that is not a number
-                new = np.inf
-            if new <= cost:
-                break
-            damping *= 10.0
-            if damping > MAX_DAMPING:
-                return state, values, history
-        decrease, cost, state, values = cost - new, new, next_state, next_values
-        history.append(cost)
-        damping = max(damping / 10.0, MIN_DAMPING)
-        if progress is not None:
-            progress(len(history) - 1, settings.max_iterations)
-        if decrease <= settings.tolerance * cost:
-            break
-    return state, values, history
-
-
-class Columns:
-    """Where each variable of the rest of the graph stands: cameras first, seven columns each, then all others."""
-
-    def __init__(
-        self,
-        rest: gtsam.NonlinearFactorGraph,
-        values: gtsam.Values,
-        cameras: list[int],
-        held: Collection[int] = (),
-    ):
-        """Lay out the columns.
-
-        Args:
-            rest: the factors.
-            values: all their variables, and the cameras.
-            cameras: keys of pose and scale of every view of the map, in order.
-            held: keys of the variables that do not move.
-        """
-        zero = values.zeroVectors()
-        self.cameras = cameras
-        self.n_cameras = CAMERA * (len(cameras) // 2)
-        known = set(cameras)
-        others = [k for k in values.keys() if k not in known]
-        self.start = {k: CAMERA * (n // 2) + 6 * (n % 2) for n, k in enumerate(cameras)}
-        self.size = {k: zero.at(k).size for k in values.keys()}
-        self.total = self.n_cameras
-        for k in others:
-            self.start[k], self.total = self.total, self.total + self.size[k]
-        ordering = gtsam.Ordering()
-        place = []
-        for k in rest.keyVector():
-            ordering.push_back(k)
-            place.append(np.arange(self.start[k], self.start[k] + self.size[k]))
-        self.ordering, self.place = ordering, np.concatenate(place)
-        free = [np.arange(first, first + self.size[k]) for k, first in self.start.items() if k not in held]
-        self.free = np.sort(np.concatenate(free))
-
-    def normal_equations(self, linear: gtsam.GaussianFactorGraph) -> tuple[np.ndarray, np.ndarray]:
-        """Hessian and gradient of the rest of the graph over all columns."""
-        part, information = linear.hessian(self.ordering)
-        hessian, gradient = np.zeros((self.total, self.total)), np.zeros(self.total)
-        hessian[np.ix_(self.place, self.place)] = part
-        gradient[self.place] = -np.asarray(information).ravel()
-        return hessian, gradient
-
-    def vectors(self, step: np.ndarray) -> gtsam.VectorValues:
-        """A step as GTSAM takes it."""
-        delta = gtsam.VectorValues()
-        for k, first in self.start.items():
-            delta.insert(k, step[first : first + self.size[k]])
-        return delta
-
-
-def _step(
-    terms: MapTerms,
-    state: MapState,
-    values: gtsam.Values,
-    columns: Columns,
-    hessian: np.ndarray,
-    gradient: np.ndarray,
-    damping: float,
-) -> tuple[MapState, gtsam.Values]:
-    """State and values after one damped Gauss-Newton step."""
-    reduced, normal, right = _joined(terms, state, columns, hessian, gradient, damping)
-    step = np.zeros(columns.total)
-    step[columns.free] = cho_solve(cho_factor(normal, lower=True, overwrite_a=True), -right)
-    depths, points = reduced.back_substitute(step[: columns.n_cameras])
-    trial = values.retract(columns.vectors(step))
-    views = [decode(k)[2] for k in columns.cameras[::2]]
-    return MapState(*camera_arrays(trial, views), state.b + depths, state.m + points), trial
-
-
-def _joined(
-    terms: MapTerms, state: MapState, columns: Columns, hessian: np.ndarray, gradient: np.ndarray, damping: float
-) -> tuple[Reduced, np.ndarray, np.ndarray]:
-    """The normal equations of the free cameras and other variables, the map eliminated."""
-    reduced = terms.reduce(state, damping)
-    n = columns.n_cameras
-    normal, right = hessian + damping * np.eye(columns.total), gradient.copy()
-    normal[:n, :n] += reduced.hessian
-    right[:n] += reduced.gradient
-    return reduced, normal[np.ix_(columns.free, columns.free)], right[columns.free]
 
 
 def _with_gauge(
@@ -257,7 +133,7 @@ def _with_gauge(
         if LOG_DEPTH in letters or MAP_POINT in letters:
             raise InputError(f"fusion: a factor on {describe(factor.keys()[0])} is part of the map, which fuse builds")
         held |= letters == [CAMERA_POSE]
-        lengths |= letters == [CAMERA_POSE] * 2 or letters == [VIEW_SCALE]
+        lengths |= letters == [VIEW_SCALE] or (letters == [CAMERA_POSE] * 2 and not _at_rest(factor))
         touched.update(factor.keys())
         rest.push_back(factor)
     blind = [v for v in np.flatnonzero(~sightings.seen.any(axis=1)).tolist() if pose_key(v) not in touched]
@@ -273,6 +149,13 @@ def _with_gauge(
         scale = values.atVector(first) if values.exists(first) else np.zeros(1)
         rest.add(gtsam.PriorFactorVector(first, scale, gtsam.noiseModel.Isotropic.Sigma(1, GAUGE_SIGMA)))
     return rest
+
+
+def _at_rest(factor: gtsam.NonlinearFactor) -> bool:
+    """Whether a factor is an odometry step of no length, which says nothing about the unit."""
+    if not isinstance(factor, gtsam.BetweenFactorPose3):
+        return False
+    return float(np.linalg.norm(factor.measured().translation())) <= STANDSTILL
 
 
 def _start_values(rest: gtsam.NonlinearFactorGraph, values: gtsam.Values, cameras: list[int]) -> gtsam.Values:
@@ -291,16 +174,6 @@ def _start_values(rest: gtsam.NonlinearFactorGraph, values: gtsam.Values, camera
     return start
 
 
-def camera_arrays(values: gtsam.Values, views: Iterable[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rotations (F, 3, 3), centres (F, 3) and log scales (F,) of some views."""
-    cameras = [(values.atPose3(pose_key(view)), values.atVector(key(VIEW_SCALE, 0, view))[0]) for view in views]
-    return (
-        np.array([pose.rotation().matrix() for pose, _ in cameras]),
-        np.array([pose.translation() for pose, _ in cameras]),
-        np.array([g for _, g in cameras]),
-    )
-
-
 def _fused(
     terms: MapTerms,
     sightings: Sightings,
@@ -311,7 +184,7 @@ def _fused(
     cameras: list[int],
     history: list[float],
 ) -> Fused:
-    _, normal, _ = _joined(terms, state, columns, *columns.normal_equations(rest.linearize(values)), 0.0)
+    _, normal, _ = joined(terms, state, columns, *columns.normal_equations(rest.linearize(values)), 0.0)
     try:
         inverse = cho_solve(cho_factor(normal, lower=True), np.eye(len(normal)))
     except LinAlgError as error:

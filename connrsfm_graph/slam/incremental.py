@@ -1,16 +1,17 @@
-"""Incremental fusion with a fixed lag: views arrive one by one, the newest are estimated, older ones are held.
+"""Incremental fusion: views arrive one by one, the newest are estimated, older ones keep their shapes.
 
 The cost is that of `assemble`. With each view the last `lag` views, their map points and whatever else is tied to them
-are minimised over, given the estimates of all before: a point that comes back is tied to where it was last seen, with
-a variance that has grown with time. The work per view is bounded, whatever the length of the sequence; `finish` lets
-go of everything and ends in the minimum of the batch fusion.
+are minimised over, given the estimates of all before (`window`); whenever the sequence has grown by a certain part, all
+cameras are relaxed with the shapes given (`relaxation`), which takes time in proportion to the views, but ever more
+rarely. The work per view is bounded on average, whatever the length of the sequence. What remains above the minimum is
+in the shapes: with the default lag less than 0.1 % of the cost (`experiments.benchmarks.growth` measures it). `finish`
+lets go of everything and ends in the minimum of the batch fusion.
 
 Nothing is stored before a view has been minimised over: whatever is wrong with it, the estimate is as it was before.
 """
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from dataclasses import dataclass, field
 
 import gtsam
@@ -19,11 +20,14 @@ import numpy as np
 from connrsfm_graph.errors import InputError
 from connrsfm_graph.metrics.alignment import align_similarity
 from connrsfm_graph.slam.assemble import MapModel, link_scales, pose_key
-from connrsfm_graph.slam.elimination import MapState, MapTerms
-from connrsfm_graph.slam.fuse import GAUGE_SIGMA, Columns, Fused, FusionConfig, camera_arrays, fuse, minimise
-from connrsfm_graph.slam.sightings import FusionNoise, Sightings, View, stacked
+from connrsfm_graph.slam.fuse import GAUGE_SIGMA, Fused, FusionConfig, fuse
+from connrsfm_graph.slam.growing_map import GrowingMap
+from connrsfm_graph.slam.noise import FusionNoise
+from connrsfm_graph.slam.relaxation import relaxed
+from connrsfm_graph.slam.sightings import View
+from connrsfm_graph.slam.window import Window, camera_keys, is_camera
 from connrsfm_graph.solvers.interface import Levenberg
-from factors.keys import CAMERA_POSE, LOG_DEPTH, MAP_POINT, VIEW_SCALE, decode, describe, key
+from factors.keys import LOG_DEPTH, MAP_POINT, VIEW_SCALE, decode, describe, key
 
 _FEWEST = 4
 """Points from which the pose of a view without odometry is predicted."""
@@ -35,22 +39,22 @@ class IncrementalConfig:
 
     map: MapModel = field(default_factory=MapModel)
     """How the map moves."""
-    lag: int = 15
+    lag: int = 30
     """Views that are estimated together, the newest included."""
-    bootstrap: int = 60
-    """Until this many views have come all are estimated together: what is held too early holds a wrong scale."""
+    growth: float = 1.2
+    """All cameras are relaxed when the views are this many times those of the last relaxation."""
     scale_sigma: float = 1.0
     """Standard deviation of the first view's log scale: what is known of the unit before odometry tells."""
     levenberg: Levenberg = field(default_factory=lambda: Levenberg(max_iterations=10, tolerance=1e-3))
     """Settings of the minimisation with every view."""
+    relaxation: Levenberg = field(default_factory=lambda: Levenberg(max_iterations=20, tolerance=1e-6))
+    """Settings of the relaxation."""
 
     def __post_init__(self) -> None:
         if self.lag < 2:
             raise InputError(f"incremental lag is {self.lag}, expected at least 2")
-
-    def first_free(self, number: int) -> int:
-        """The oldest view that is estimated together with view `number`."""
-        return 0 if number < self.bootstrap else max(0, number - self.lag + 1)
+        if not self.growth > 1.0:
+            raise InputError(f"incremental growth is {self.growth}, expected more than 1")
 
 
 class IncrementalFusion:
@@ -73,22 +77,20 @@ class IncrementalFusion:
         """
         self.noise = noise
         self.config = config or IncrementalConfig()
-        self.views: list[View] = []
-        """What every view saw."""
+        self.map = GrowingMap(self.config.map.window)
+        """What the views saw and where their points are."""
         self.graph = gtsam.NonlinearFactorGraph()
         """All factors but those of the map and the links between scales."""
         self.values = gtsam.Values()
         """Current estimate of all variables but those of the map."""
         self._first = gtsam.Pose3() if first is None else gtsam.Pose3(first)
         self._log_scale = log_scale
-        self._log_depth: list[np.ndarray] = []
-        self._points: list[np.ndarray] = []
-        self._history: dict[int, list[tuple[int, int]]] = {}  # (view, row) of every sighting of a point
+        self._relaxed = self.config.lag  # views at the last relaxation; before, the window holds all
         self._touching: dict[int, list[int]] = {}  # indices in the graph of the factors on a variable
 
     @property
     def n_views(self) -> int:
-        return len(self.views)
+        return self.map.n_views
 
     def add_view(
         self,
@@ -110,9 +112,12 @@ class IncrementalFusion:
             Number of the view.
 
         Raises:
-            InputError: the view cannot be used; the message says why and the estimator is as it was before.
+            InputError: the view cannot be used; the message says why and the estimator is as it was before. What a
+                factor of the user raises later, during the minimisation, is passed on and changes nothing either.
         """
         number = self.n_views
+        if number >= self.config.growth * self._relaxed:
+            self.relax()
         try:
             view = View.checked(view.points, view.image, view.log_depth, view.depth_std)
             pose, scale = self._predicted(view, step)
@@ -130,8 +135,10 @@ class IncrementalFusion:
             trial = gtsam.Values(self.values)
             trial.insert(new)
             _try_out(graph, new, trial)
-            window = _Window(self, number, view, trial, graph)
-            state, estimate = window.minimised()
+            first = max(0, number - self.config.lag + 1)
+            tied = self._tied(first, number, graph)
+            window = Window(self.map, view, first, tied, trial, self.noise, self.config.map)
+            state, estimate = window.minimise(self.config.levenberg)
         except InputError as error:
             raise InputError(f"view {number}: {error}; the view was not added") from error
         # Nothing can fail from here on.
@@ -141,13 +148,14 @@ class IncrementalFusion:
             for k in graph.at(n).keys():
                 self._touching.setdefault(k, []).append(self.graph.size() + n)
         self.graph.push_back(graph)
-        self.views.append(view)
-        self._log_depth.append(np.empty(len(view.points)))
-        self._points.append(np.empty((len(view.points), 3)))
-        for row, point in enumerate(view.points.tolist()):
-            self._history.setdefault(point, []).append((number, row))
+        self.map.append(view)
         window.store(state)
         return number
+
+    def relax(self) -> None:
+        """Move all cameras with the shapes of their surfaces given; done by itself as the sequence grows."""
+        self.values = relaxed(self.map, self.graph, self.values, self.noise, self.config.relaxation)
+        self._relaxed = max(self.n_views, self.config.lag)
 
     def pose(self, view: int) -> np.ndarray:
         """(4, 4) camera to world, the current estimate."""
@@ -158,31 +166,32 @@ class IncrementalFusion:
         return float(self.values.atVector(key(VIEW_SCALE, 0, view))[0])
 
     def map_points(self, view: int) -> np.ndarray:
-        """(N, 3) current estimate of where the points of a view were."""
-        return self._points[view].copy()
-
-    def sightings(self) -> Sightings:
-        """What all views saw, points numbered from 0."""
-        size = 1 + max((int(view.points.max(initial=-1)) for view in self.views), default=-1)
-        return stacked(self.views, [np.arange(len(view.points)) for view in self.views], np.arange(size))
+        """(N, 3) current estimate of where the points of a view were in the world."""
+        pose = self.pose(view)
+        return pose[:3, 3] + np.exp(self.log_scale(view)) * self.map.shape[view] @ pose[:3, :3].T
 
     def finish(self, config: FusionConfig | None = None) -> Fused:
         """The batch fusion of everything so far, from the current estimate."""
         config = config or FusionConfig(map=self.config.map)
-        return fuse(self.sightings(), self.noise, self.graph, self.values, config, settle=False)
+        sightings = self.map.sightings()
+        log_depth, points = np.zeros(sightings.seen.shape), np.zeros((*sightings.seen.shape, 3))
+        for number, view in enumerate(self.map.views):
+            log_depth[number, view.points] = self.map.log_depth[number]
+            points[number, view.points] = self.map_points(number)
+        return fuse(sightings, self.noise, self.graph, self.values, config, estimate=(log_depth, points))
 
     def _predicted(self, view: View, step: np.ndarray | None) -> tuple[gtsam.Pose3, float]:
         """Pose and log scale to start a view from: by odometry, or by the map as it was last seen."""
-        if not self.views:
+        if not self.n_views:
             return self._first, self._log_scale
         scale = self.log_scale(self.n_views - 1)
         if step is not None:
             return gtsam.Pose3(self.pose(self.n_views - 1) @ np.asarray(step, dtype=float)), scale
-        known = [row for row, point in enumerate(view.points.tolist()) if point in self._history]
+        last = [self.map.last_sighting(point) for point in view.points.tolist()]
+        known = [row for row, sighting in enumerate(last) if sighting is not None]
         if len(known) < _FEWEST:
             raise InputError(f"it shares {len(known)} points with the map, expected {_FEWEST}, and has no odometry")
-        last = [self._history[point][-1] for point in view.points[known].tolist()]
-        target = np.array([self._points[number][row] for number, row in last])
+        target = np.array([self.map_points(number)[row] for number, row in filter(None, last)])
         _, R, t = align_similarity(np.exp(scale) * view.camera_points()[known], target)
         return gtsam.Pose3(gtsam.Rot3(R), t), scale
 
@@ -204,97 +213,26 @@ class IncrementalFusion:
             graph.add(gtsam.BetweenFactorPose3(pose_key(number - 1), pose_key(number), gtsam.Pose3(step), noise))
         return graph
 
-
-class _Window:
-    """The newest views as a problem of their own, with the places before them that their points are tied to."""
-
-    def __init__(
-        self,
-        fusion: IncrementalFusion,
-        number: int,
-        newest: View,
-        values: gtsam.Values,
-        new: gtsam.NonlinearFactorGraph,
-    ):
-        self.fusion = fusion
-        config = fusion.config
-        first = config.first_free(number)
-        views = [*fusion.views, newest]
-        self.points = np.unique(np.concatenate([view.points for view in views[first:]]))
-        rows = {n: list(range(len(views[n].points))) for n in range(first, number + 1)}
-        for point in self.points.tolist():
-            history = fusion._history.get(point, [])
-            before = bisect_left(history, (first, 0))
-            for n, row in history[max(0, before - config.map.window + 1) : before]:
-                rows.setdefault(n, []).append(row)
-        self.numbers = sorted(rows)
-        self.rows = [np.array(rows[n], dtype=int) for n in self.numbers]
-        held = np.array(self.numbers) < first
-        sightings = stacked([views[n] for n in self.numbers], self.rows, self.points)
-        self.terms = MapTerms(sightings, fusion.noise, config.map, np.array(self.numbers), held)
-
-        free = {k for n in range(first, number + 1) for k in _camera(n)}
-        self.graph = self._tied(free, number, new)
-        free |= {k for k in self.graph.keyVector() if not _is_camera(k)}
-        cameras = [k for n in self.numbers for k in _camera(n)]
-        self.values = values.extract(list({*cameras, *self.graph.keyVector()}))
-        self.columns = Columns(self.graph, self.values, cameras, {k for k in self.values.keys() if k not in free})
-
-    def minimised(self) -> tuple[MapState, gtsam.Values]:
-        """Map and variables after minimisation from the current estimate."""
-        terms, fusion = self.terms, self.fusion
-        start = terms.start(*camera_arrays(self.values, self.numbers))
-        for local, (n, rows) in enumerate(zip(self.numbers, self.rows, strict=True)):
-            if n < fusion.n_views:
-                mine = self._mine(local)
-                order = np.argsort(fusion.views[n].points[rows])
-                start.b[mine], start.m[mine] = fusion._log_depth[n][rows[order]], fusion._points[n][rows[order]]
-        settings = fusion.config.levenberg
-        state, values, _ = minimise(terms, start, self.graph, self.values, self.columns, settings)
-        return state, values
-
-    def store(self, state: MapState) -> None:
-        """Write the free part of the map back."""
-        fusion = self.fusion
-        for local, (n, rows) in enumerate(zip(self.numbers, self.rows, strict=True)):
-            mine = self._mine(local)
-            if self.terms.free[mine].all():
-                order = np.argsort(fusion.views[n].points[rows])
-                fusion._log_depth[n][rows[order]], fusion._points[n][rows[order]] = state.b[mine], state.m[mine]
-
-    def _mine(self, local: int) -> np.ndarray:
-        """Sightings of one view, in order of points."""
-        return np.flatnonzero(self.terms.view == local)
-
-    def _tied(self, cameras: set[int], number: int, new: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGraph:
-        """Factors of the free cameras, and those of the other variables in them from views not long before."""
-        fusion = self.fusion
-        recent = number - 2 * fusion.config.lag
+    def _tied(self, first: int, number: int, new: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGraph:
+        """Factors on the cameras from `first` on, and recent ones of the other variables in them."""
+        recent = number - 2 * self.config.lag
 
         def found(keys: set[int]) -> set[int]:
-            return {n for k in keys for n in fusion._touching.get(k, [])}
+            return {n for k in keys for n in self._touching.get(k, [])}
 
         def last_view(factor: gtsam.NonlinearFactor) -> int:
-            return max((decode(k)[2] for k in factor.keys() if _is_camera(k)), default=number)
+            return max((decode(k)[2] for k in factor.keys() if is_camera(k)), default=number)
 
-        direct = found(cameras)
+        direct = found({k for n in range(first, number + 1) for k in camera_keys(n)})
         graph = gtsam.NonlinearFactorGraph()
-        for n in range(max(1, fusion.config.first_free(number)), number + 1):
-            graph.add(link_scales(n - 1, n, fusion.noise))
-        factors = [fusion.graph.at(n) for n in direct] + [new.at(n) for n in range(new.size())]
-        others = {k for factor in factors for k in factor.keys() if not _is_camera(k)}
-        indirect = [fusion.graph.at(n) for n in sorted(found(others) - direct)]
+        for n in range(max(1, first), number + 1):
+            graph.add(link_scales(n - 1, n, self.noise))
+        factors = [self.graph.at(n) for n in direct] + [new.at(n) for n in range(new.size())]
+        others = {k for factor in factors for k in factor.keys() if not is_camera(k)}
+        indirect = [self.graph.at(n) for n in sorted(found(others) - direct)]
         for factor in [*factors, *(factor for factor in indirect if last_view(factor) >= recent)]:
             graph.push_back(factor)
         return graph
-
-
-def _camera(view: int) -> tuple[int, int]:
-    return pose_key(view), key(VIEW_SCALE, 0, view)
-
-
-def _is_camera(k: int) -> bool:
-    return decode(k)[0] in (CAMERA_POSE, VIEW_SCALE)
 
 
 def _try_out(graph: gtsam.NonlinearFactorGraph, new: gtsam.Values, values: gtsam.Values) -> None:
@@ -306,7 +244,7 @@ def _try_out(graph: gtsam.NonlinearFactorGraph, new: gtsam.Values, values: gtsam
     missing = [k for k in needed if not values.exists(k)]
     if missing:
         raise InputError(f"a factor asks for {describe(missing[0])}, which has no value")
-    idle = [k for k in new.keys() if k not in needed and not _is_camera(k)]
+    idle = [k for k in new.keys() if k not in needed and not is_camera(k)]
     if idle:
         raise InputError(f"{describe(idle[0])} is in no factor")
     try:

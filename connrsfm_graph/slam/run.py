@@ -9,9 +9,10 @@ import gtsam
 import numpy as np
 
 from connrsfm_graph.errors import InputError
-from connrsfm_graph.slam.cameras import add_background, add_odometry, start_cameras
+from connrsfm_graph.slam.cameras import STANDSTILL, add_background, add_odometry, start_cameras
 from connrsfm_graph.slam.fuse import Fused, FusionConfig, fuse
-from connrsfm_graph.slam.sightings import FusionNoise, Sightings, estimate_noise
+from connrsfm_graph.slam.noise import FusionNoise, estimate_noise
+from connrsfm_graph.slam.sightings import Sightings
 from connrsfm_graph.slam.storage import FusionProblem
 from factors.keys import VIEW_SCALE, key
 
@@ -33,9 +34,14 @@ class SlamConfig:
                 raise InputError(f"slam {name} is {getattr(self, name)}, expected a positive number")
 
     def odometry_sigmas(self, steps: np.ndarray) -> np.ndarray:
-        """(F-1, 6) standard deviations of odometry steps; a step of no length gets the median step's."""
+        """(F-1, 6) standard deviations of odometry steps (F-1, 4, 4).
+
+        A step counts as no shorter than a hundredth of the median step. Odometry that never moves gives no unit of
+        length; the reconstruction's then holds, which is about the distance of the surface.
+        """
         length = np.linalg.norm(steps[:, :3, 3], axis=1)
-        least = max(0.01 * float(np.median(length)), 1e-9)
+        moving = length[length > STANDSTILL]
+        least = 0.01 * (float(np.median(moving)) if len(moving) else 1.0)
         turn = np.full((len(steps), 3), np.radians(self.odometry_rotation_deg))
         return np.concatenate(
             [turn, np.tile(self.odometry_translation * np.maximum(length, least)[:, None], 3)], axis=1

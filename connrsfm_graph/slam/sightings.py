@@ -1,8 +1,7 @@
 """What a reconstruction without poses says about the world: every surface point on its sight ray, at a depth.
 
 A sighting is one point in one view: its image point with the image noise, and its log depth in the reconstruction's
-unit with a standard deviation. The noise levels that a reconstruction does not state follow from how neighbouring
-views fit onto each other (`estimate_noise`).
+unit with a standard deviation.
 """
 
 from __future__ import annotations
@@ -12,34 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from connrsfm_graph.errors import InputError
-from connrsfm_graph.metrics.alignment import align_similarity
 from connrsfm_graph.reconstruction import Reconstruction
-from connrsfm_graph.warps.noise import estimate_pixel_noise
-
-_FEWEST = 4
-"""Shared points from which two views can be fitted onto each other with something left to see the noise by."""
-_MAD = 1.4826
-"""Standard deviation of a normal distribution over its median absolute deviation."""
-
-
-@dataclass(frozen=True)
-class FusionNoise:
-    """Noise levels of the factors that tie a reconstruction to the world."""
-
-    image: float
-    """Standard deviation of a coordinate of the image points, normalised coordinates."""
-    depth: float
-    """Standard deviation of the log depths where the reconstruction does not state its own."""
-    motion: float
-    """Standard deviation of a coordinate of a point's motion (or change of velocity) between neighbouring views, in
-    the reconstruction's unit of depth."""
-    scale: float
-    """Standard deviation of the change of log scale between neighbouring views."""
-
-    def __post_init__(self) -> None:
-        for name in ("image", "depth", "motion", "scale"):
-            if not 0.0 < getattr(self, name) < np.inf:
-                raise InputError(f"fusion: {name} noise is {getattr(self, name)}, expected a positive number")
 
 
 @dataclass(frozen=True)
@@ -168,52 +140,3 @@ def stacked(views: list[View], rows: list[np.ndarray], points: np.ndarray) -> Si
         image[n, column], log_depth[n, column] = view.image[row], view.log_depth[row]
         depth_std[n, column] = view.depth_std[row]
     return Sightings(image, seen, log_depth, depth_std)
-
-
-def estimate_noise(sightings: Sightings, image_sigma: float | None = None) -> FusionNoise:
-    """Noise levels from the fit of neighbouring views onto each other, without any truth.
-
-    Each view is fitted to the next by a similarity. What remains across the sight rays is motion; what remains along
-    them beyond that is noise of the two depths; the scales of the similarities are the drift of the unit. Medians over
-    all points, so that a minority of wrong tracks does not matter. Where the depths' errors are alike in neighbouring
-    views, as those of a reconstruction are, the estimate of the depth is their change only.
-
-    Args:
-        sightings: two views or more.
-        image_sigma: noise of the image points, normalised coordinates; estimated from image warps where None.
-
-    Raises:
-        InputError: no two neighbouring views share enough points.
-    """
-    points = sightings.points()
-    across, along, scales, depths = [], [], [], []
-    for a in range(sightings.n_views - 1):
-        shared = sightings.seen[a] & sightings.seen[a + 1]
-        if shared.sum() < _FEWEST:
-            continue
-        source, target = points[a, shared], points[a + 1, shared]
-        scale, R, t = align_similarity(source, target)
-        difference = target - (scale * source @ R.T + t)
-        ray = target / np.linalg.norm(target, axis=1, keepdims=True)
-        radial = (difference * ray).sum(axis=1)
-        along.append(radial)
-        across.append(np.linalg.norm(difference - radial[:, None] * ray, axis=1))
-        scales.append(np.log(scale))
-        depths.append(np.linalg.norm(target, axis=1))
-    if not along:
-        raise InputError(f"fusion: no two neighbouring views share {_FEWEST} points; state the noise levels")
-    # The length of a normal vector in the plane has median 1.1774 sigma.
-    motion = float(np.median(np.concatenate(across))) / 1.1774
-    distance = float(np.median(np.concatenate(depths)))
-    radial_std = _MAD * float(np.median(np.abs(np.concatenate(along))))
-    if image_sigma is None:
-        neighbours = np.column_stack([np.arange(sightings.n_views - 1), np.arange(1, sightings.n_views)])
-        image_sigma = estimate_pixel_noise(sightings.image, sightings.seen, neighbours)
-    image_sigma = image_sigma if np.isfinite(image_sigma) else 1e-3
-    floor = 0.1 * image_sigma
-    return FusionNoise(
-        image=max(image_sigma, 1e-6),
-        depth=max(np.sqrt(max(radial_std**2 - motion**2, 0.0) / 2.0) / distance, floor),
-        motion=max(motion, floor * distance),
-        scale=max(_MAD * float(np.median(np.abs(scales))), 1e-3),
-    )

@@ -16,7 +16,8 @@ from connrsfm_graph.errors import InputError
 from connrsfm_graph.files import read_npz, written_beside
 from connrsfm_graph.slam.assemble import MapModel
 from connrsfm_graph.slam.fuse import Fused
-from connrsfm_graph.slam.sightings import FusionNoise, Sightings
+from connrsfm_graph.slam.noise import FusionNoise
+from connrsfm_graph.slam.sightings import Sightings
 from factors.keys import describe
 
 

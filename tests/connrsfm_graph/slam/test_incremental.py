@@ -28,9 +28,7 @@ UNIT = gtsam.noiseModel.Unit.Create(1)
 
 
 def grown(case, n=None, **settings):
-    fusion = IncrementalFusion(
-        NOISE, IncrementalConfig(**{"bootstrap": 4} | settings), case.scene.poses[0], log_scale=1.0
-    )
+    fusion = IncrementalFusion(NOISE, IncrementalConfig(**settings), case.scene.poses[0], log_scale=1.0)
     odometry = sigmas(case.steps)
     for view in range(case.sightings.n_views if n is None else n):
         step = (case.steps[view - 1], odometry[view - 1]) if view else (None, None)
@@ -86,7 +84,7 @@ def test_without_odometry_the_surface_carries_the_camera():
 @pytest.mark.slow
 def test_work_per_view_does_not_grow():
     case = posed(n_frames=120, n_points=30, n_background=0, gaps=0.0)
-    fusion = IncrementalFusion(NOISE, IncrementalConfig(lag=8, bootstrap=8), case.scene.poses[0], log_scale=1.0)
+    fusion = IncrementalFusion(NOISE, IncrementalConfig(lag=8), case.scene.poses[0], log_scale=1.0)
     odometry, seconds = sigmas(case.steps), []
     for view in range(120):
         started = time.process_time()
