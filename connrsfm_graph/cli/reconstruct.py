@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -36,6 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--method", default=DEFAULT_METHOD, help="method or baseline (default: %(default)s)")
     add_configuration(parser)
+    parser.add_argument("--images", type=Path, metavar="IMAGES", help="the images that were tracked, for the page")
     parser.add_argument("--no-report", action="store_true", help="write no page with pictures")
 
 
@@ -43,10 +44,14 @@ def run(arguments: argparse.Namespace) -> None:
     from connrsfm_graph.files import check_output_folder
     from connrsfm_graph.progress import Progress
     from connrsfm_graph.tracks import load_tracks
+    from connrsfm_graph.tracks.images import images_of
 
     check_output_folder(arguments.out)
     config = resolved(arguments)
     tracks = load_tracks(arguments.tracks, arguments.intrinsics, arguments.camera)
+    images = None
+    if arguments.images is not None:
+        images = images_of(arguments.images, tracks.image_names, tracks.n_frames)
     reconstruct_into(
         arguments.out,
         tracks,
@@ -55,6 +60,7 @@ def run(arguments: argparse.Namespace) -> None:
         Progress(),
         method=arguments.method,
         report=not arguments.no_report,
+        images=images,
     )
 
 
@@ -66,7 +72,7 @@ def reconstruct_into(
     progress: Progress,
     method: str = DEFAULT_METHOD,
     report: bool = True,
-    images: Sequence[np.ndarray] | None = None,
+    images: Iterable[np.ndarray] | None = None,
 ) -> None:
     """Reconstruct, write everything into `out` and say what came of it.
 

@@ -9,6 +9,8 @@ DEPTH: Ramp = ("#ffe3b3", "#f5b97f", "#a5cdb9", "#62a3bb", "#4273a3")
 """Near to far."""
 ERROR: Ramp = ("#eef1f3", "#fbdcae", "#f5a166", "#dc5044", "#8c1a33")
 """None to large."""
+SCALE: Ramp = ("#3767a6", "#93b8d8", "#f1efe9", "#e6a27c", "#b23a2e")
+"""Shrunk over unchanged to stretched."""
 
 
 def ramp_colours(ramp: Ramp, values: np.ndarray, lower: float, upper: float) -> np.ndarray:

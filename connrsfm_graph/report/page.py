@@ -7,19 +7,21 @@ import html
 import json
 import math
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from connrsfm_graph.dense.layout import DENSE_FOLDER
 from connrsfm_graph.files import folder_written_beside
 from connrsfm_graph.metrics import Evaluation
 from connrsfm_graph.reconstruction import Reconstruction, RunRecord
 from connrsfm_graph.report.charts import bar_chart, duration_chart, graph_chart, line_chart, range_chart
-from connrsfm_graph.report.colour import DEPTH, ERROR, Ramp
+from connrsfm_graph.report.photos import photos_of
 from connrsfm_graph.report.pictures import Painter
+from connrsfm_graph.report.shown import DenseSurfaces, paints
 from connrsfm_graph.report.surfaces import Surfaces
 from connrsfm_graph.report.viewer import viewer
 
@@ -30,9 +32,10 @@ MAX_FRAMES = 12
 
 
 def remove_report(out: Path) -> None:
-    """Remove the page of an earlier result from a folder, so that none stands beside results it does not show."""
+    """Remove page and dense surfaces of an earlier result from a folder, so that none stand beside another's."""
     (out / REPORT_FILE).unlink(missing_ok=True)
-    shutil.rmtree(out / PICTURES_FOLDER, ignore_errors=True)
+    for folder in (PICTURES_FOLDER, DENSE_FOLDER):
+        shutil.rmtree(out / folder, ignore_errors=True)
 
 
 def write_report(
@@ -41,30 +44,37 @@ def write_report(
     record: RunRecord,
     truth: np.ndarray | None = None,
     evaluation: Evaluation | None = None,
-    images: Sequence[np.ndarray] | None = None,
+    images: Iterable[np.ndarray] | None = None,
 ) -> Path:
     """Write `report.html` and the folder `pictures` into `out`; returns the page's path.
+
+    Dense surfaces are shown where `connrsfm densify` has left some in `out`.
 
     Args:
         out: folder, made where it does not exist.
         reconstruction, record: what is reported.
         truth: (F, P, 3) true points in camera frames, NaN where unknown.
         evaluation: figures against the same truth.
-        images: F images (height, width[, 3]) uint8 RGB to draw the tracks on.
+        images: F images (height, width[, 3]) uint8 RGB, texture of the surfaces and ground of the tracks; each is read
+            once. Those of the dense surfaces where None.
 
     Raises:
         InputError: `out` is a file, or the truth does not fit the reconstruction.
     """
     surfaces = Surfaces.of(reconstruction, truth)
+    dense = DenseSurfaces.beside(Path(out))
+    if images is None and dense is not None:
+        images = dense.images(reconstruction.n_frames)
+    photos = None if images is None else photos_of(images, reconstruction.pixels)
     with folder_written_beside(out) as part:
         (part / PICTURES_FOLDER).mkdir()
         frames = _frames(
-            reconstruction, surfaces, evaluation, Painter(reconstruction, surfaces, images), part / PICTURES_FOLDER
+            reconstruction, surfaces, evaluation, Painter(reconstruction, surfaces, photos), part / PICTURES_FOLDER
         )
         sections = [
             _header(reconstruction, record, evaluation),
             _warnings(record.warnings),
-            viewer(reconstruction, surfaces),
+            viewer(reconstruction, surfaces, photos, dense),
             frames,
             _charts(reconstruction, record, evaluation),
             _decisions(record.decisions),
@@ -128,11 +138,11 @@ def _frames(
     for f in shown:
         cells = []
         for picture in painter.pictures(f):
-            png = picture.png()
-            (folder / f"{f:04d}_{picture.name}.png").write_bytes(png)
+            (folder / f"{f:04d}_{picture.name}.png").write_bytes(picture.png())
+            embedded = base64.b64encode(picture.webp()).decode()
             cells.append(
                 f'<figure><img alt="{picture.caption}, {html.escape(reconstruction.frame_name(f))}" '
-                f'src="data:image/png;base64,{base64.b64encode(png).decode()}">'
+                f'src="data:image/webp;base64,{embedded}">'
                 f"<figcaption>{picture.caption}</figcaption></figure>"
             )
         articles.append(
@@ -161,21 +171,13 @@ def _frame_line(reconstruction: Reconstruction, evaluation: Evaluation | None, f
 
 
 def _scales(surfaces: Surfaces) -> str:
-    lower, upper = surfaces.relief_range()
-    unit = "" if surfaces.truth is None else ", unit of the truth"
-    scales = [_scale(DEPTH, f"{lower:+.3g}", f"{upper:+.3g}", f"depth from the surface's middle{unit}")]
-    if surfaces.error is not None:
-        scales.append(
-            _scale(ERROR, "0", f"{surfaces.error_range()[1]:.2g}", "distance to the truth, % of the surface's extent")
-        )
-    return f"<div class=scales>{''.join(scales)}</div>"
-
-
-def _scale(ramp: Ramp, lower: str, upper: str, what: str) -> str:
-    gradient = f"linear-gradient(90deg, {', '.join(ramp)})"
-    return (
-        f'<div><span>{lower}</span><i style="background: {gradient}"></i><span>{upper}</span><span>{what}</span></div>'
+    scales = "".join(
+        f'<div><span>{way.ends[0]}</span><i style="background: linear-gradient(90deg, {", ".join(way.ramp)})"></i>'
+        f"<span>{way.ends[1]}</span><span>{way.unit}</span></div>"
+        for way in paints(surfaces)
+        if way.name in ("depth", "error")
     )
+    return f"<div class=scales>{scales}</div>"
 
 
 def _charts(reconstruction: Reconstruction, record: RunRecord, evaluation: Evaluation | None) -> str:

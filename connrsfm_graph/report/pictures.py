@@ -10,6 +10,7 @@ import numpy as np
 
 from connrsfm_graph.reconstruction import Reconstruction
 from connrsfm_graph.report.colour import DEPTH, ERROR, point_colours, ramp_colours
+from connrsfm_graph.report.photos import Photo
 from connrsfm_graph.report.raster import View, render, turned
 from connrsfm_graph.report.surfaces import Surfaces
 
@@ -30,9 +31,14 @@ class Picture:
 
     def png(self) -> bytes:
         """The picture as the content of a PNG file."""
-        done, data = cv2.imencode(
-            ".png", cv2.cvtColor(self.rgba, cv2.COLOR_RGBA2BGRA), [cv2.IMWRITE_PNG_COMPRESSION, 6]
-        )
+        return self._encoded(".png", [cv2.IMWRITE_PNG_COMPRESSION, 6])
+
+    def webp(self) -> bytes:
+        """The picture as the content of a WebP file, a quarter of the size and not exact."""
+        return self._encoded(".webp", [cv2.IMWRITE_WEBP_QUALITY, 88])
+
+    def _encoded(self, ending: str, settings: list[int]) -> bytes:
+        done, data = cv2.imencode(ending, cv2.cvtColor(self.rgba, cv2.COLOR_RGBA2BGRA), settings)
         assert done
         return data.tobytes()
 
@@ -40,9 +46,9 @@ class Picture:
 class Painter:
     """Draws the pictures of any image, all at the scale and with the colours of the whole sequence."""
 
-    def __init__(self, reconstruction: Reconstruction, surfaces: Surfaces, images: Sequence[np.ndarray] | None = None):
-        """Images (height, width[, 3]) uint8 RGB, where given, lie under the tracks."""
-        self.reconstruction, self.surfaces, self.images = reconstruction, surfaces, images
+    def __init__(self, reconstruction: Reconstruction, surfaces: Surfaces, photos: Sequence[Photo] | None = None):
+        """Photos, where given, lie under the tracks."""
+        self.reconstruction, self.surfaces, self.photos = reconstruction, surfaces, photos
         self.identity = point_colours(_typical_place(reconstruction))
         reach = np.max([surfaces.reach(R) for R in VIEWS.values()], axis=0)
         scale = 0.47 * float((np.array(SIZE) / np.maximum(reach, np.finfo(float).tiny)).min())
@@ -89,16 +95,18 @@ class Painter:
     def _canvas(self, frame: int) -> tuple[float, np.ndarray, np.ndarray]:
         """Scale and offset from pixels to the picture, and the picture before tracks are drawn."""
         width, height = SIZE
-        if self.images is not None:
-            image = self.images[frame]
-            source_height, source_width = image.shape[:2]
-            scale = min(width / source_width, height / source_height)
-            small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-            # Colours belong to the tracks, so the image is grey and pale.
-            grey = small if small.ndim == 2 else cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
+        if self.photos is not None:
+            photo = self.photos[frame]
+            photo_height, photo_width = photo.image.shape[:2]
+            scale = min(width / photo_width, height / photo_height)
+            grey = cv2.cvtColor(
+                cv2.resize(photo.image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY
+            )
+            # Colours belong to the tracks, so the photo is grey and pale.
             pale = np.round(0.55 * grey + 0.45 * 255).astype(np.uint8)
-            # Pixel centres are at whole coordinates in both pictures.
-            return scale, np.full(2, 0.5 * scale - 0.5), cv2.cvtColor(pale, cv2.COLOR_GRAY2RGBA)
+            # Pixel centres are at whole coordinates in photo and picture.
+            offset = scale * (photo.place(np.zeros(2)) + 0.5) - 0.5
+            return scale * photo.scale, offset, cv2.cvtColor(pale, cv2.COLOR_GRAY2RGBA)
         pixels = self.reconstruction.pixels
         lower, upper = np.nanmin(pixels, axis=(0, 1)), np.nanmax(pixels, axis=(0, 1))
         margin = 14.0
