@@ -59,10 +59,13 @@ def densify(
     if not usable:
         most = max(map(len, sparse))
         raise InputError(f"no image has {FEWEST_POINTS} recovered points (the most are {most}), too few for a surface")
+    start = time.perf_counter()
     choice = choose([sparse[f] for f in usable], method, checkpoint)
+    fitting = (time.perf_counter() - start) / len(usable)
+    scale = png_scale(1.5 * max(float(sparse[f].depth.max()) for f in usable))
     with folder_written_beside(out) as part:
         folder = part / DENSE_FOLDER
-        writer = _Writer(folder, png_scale(1.5 * max(float(sparse[f].depth.max()) for f in usable)))
+        writer = _Writer(folder, scale, fitting)
         skipped, warnings = [], list(choice.warnings)
         size = (0, 0)
         for f, image in enumerate(_images_of(reconstruction, images)):
@@ -72,7 +75,7 @@ def densify(
                 warnings += _camera_warnings(points.K, size)
             _check_inside(reconstruction, f, size, images)
             if f not in usable:
-                problem = f"{len(points)} recovered points, a surface needs {FEWEST_POINTS}"
+                problem: str | None = f"{len(points)} recovered points, a surface needs {FEWEST_POINTS}"
             else:
                 problem = writer.add(f, name, points, choice.method, usable.index(f), image)
             if problem is not None:
@@ -87,7 +90,7 @@ def densify(
             reason=choice.reason,
             checkpoint=choice.checkpoint,
             size=list(size),
-            depth_png_scale=writer.scale,
+            depth_png_scale=scale,
             sequence=SEQUENCE_FILE,
             frames=writer.frames,
             skipped=skipped,
@@ -100,9 +103,11 @@ def densify(
 class _Writer:
     """Writes the surfaces of one image after the other, and keeps what the index and the animation need of them."""
 
-    def __init__(self, folder: Path, scale: float) -> None:
+    def __init__(self, folder: Path, scale: float, fitting: float) -> None:
         self.folder = folder
         self.scale = scale
+        self.fitting = fitting
+        """Seconds per image that the choice and the fit of the method took."""
         self.frames: list[DenseFrame] = []
         self._coarse: list[tuple[TexturedMesh, bytes]] = []
 
@@ -127,7 +132,7 @@ class _Writer:
                 covered=float(np.isfinite(depth).mean()),
                 depth_range=[float(np.nanmin(depth)), float(np.nanmax(depth))],
                 residual_percent=100.0 * float(np.sqrt((residual**2).mean())),
-                seconds=time.perf_counter() - start,
+                seconds=self.fitting + time.perf_counter() - start,
                 **files,
             )
         )

@@ -65,7 +65,7 @@ class DenseFrame:
     residual_percent: float
     """Root mean square difference of dense and sparse depth at the sparse points, in percent of depth."""
     seconds: float
-    """Time for the depth map, its mesh and its texture, files included."""
+    """Time for the depth map, its mesh and its texture, files and this image's share of the fit included."""
     depth: str
     depth_png: str
     texture: str
