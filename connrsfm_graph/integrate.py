@@ -268,8 +268,11 @@ def choose_bending(systems: list[SurfaceSpline]) -> float:
 def balance_scales(problem: Problem, state: State) -> State:
     """Scale every image's depths so that the median log conformal scale of each edge is 0 in the least-squares sense.
 
-    Log scales change with the depths, so that the pair factors keep their value; the mean log depth becomes 0.
+    Log scales change with the depths, so that the pair factors keep their value; the mean log depth becomes 0. The
+    depths of orthographic cameras have no scale and stay.
     """
+    if not problem.camera.kappa:
+        return state
     present = problem.weight > 0
     a, b = problem.edges.T
     used = np.flatnonzero(present.any(axis=0))

@@ -2,8 +2,9 @@
 
 Distance does not show, so there is no perspective to tell slopes apart. What remains is foreshortening:
 
-- **Known scale.** The metric up to scale fits every slope. Images must share one unit of length (K says how many pixels
-  it has in each), and the conformal scale of a pair is held at 1 until the refinement.
+- **One scale per image.** The metric up to a scale of each point fits every slope. Images share one unit of length (K
+  says how many pixels it has in each), or else one factor per image is estimated; so the conformal scale of a pair is
+  the same at all points, and held until the refinement.
 - **Pre-step.** Of the pair factors the metric rows are kept, g_a = J^T g_b J with g = I + y y^T. No image shows lengths
   larger than they are: the smallest metric that exceeds those of all images is where Levenberg-Marquardt starts. (At
   y = 0 the rows have no slope.)
@@ -38,6 +39,9 @@ DISTANCE = 1e4
 METRIC = PairNoise(1.0, np.inf, np.inf)
 _LEAST_SLOPE = 0.1
 """Slopes start no smaller: at zero there is no way out."""
+_SAME_UNIT = 0.1
+"""Images share their unit unless the estimated logarithms of their factors differ from their mean by more than this."""
+_UNIT_ROUNDS = 5
 _NEIGHBOURS = 10
 _EVENNESS = 0.3
 """Weight against changes of the slope where a few neighbours leave them open, per squared spacing of the points."""
@@ -68,12 +72,20 @@ def in_unit_of(tracks: Tracks, result: Reconstruction, unit: float) -> Reconstru
 
 
 def initialise_orthographic(problem: Problem, backend: Backend, settings: Levenberg) -> State:
-    """First- and second-order terms of every point from isometry, mirror images decided; scales at 1.
+    """First- and second-order terms of every point from isometry, mirror images decided; scales from the images' units.
 
     Raises:
         ComputationError: an image has fewer than three points with a pair.
     """
-    start = flat_state(problem).updated(first_order=_sign_free_slopes(problem))
+    jacobian, reference = _from_reference(problem)
+    unit = log_units(jacobian, reference)
+    if np.abs(unit).max() <= _SAME_UNIT:
+        unit[:] = 0.0
+    a, b = problem.edges.T
+    start = flat_state(problem).updated(
+        first_order=_sign_free_slopes(jacobian, reference, unit),
+        log_scale=np.where(problem.weight > 0, unit[b] - unit[a], 0.0),
+    )
     slopes = backend.minimise(problem, start, ("d",), METRIC, PairModel.CONFORMAL, settings).state.first_order.copy()
     constrained = problem.constrained()
     for f in range(problem.n_frames):
@@ -86,26 +98,47 @@ def initialise_orthographic(problem: Problem, backend: Backend, settings: Levenb
             break
         slopes = np.where(against[..., None], -slopes, slopes)
     sign = _agreeing_signs(problem, slopes, surface.second_order)[:, None]
-    return flat_state(problem).updated(first_order=sign * slopes, second_order=sign * surface.second_order)
+    return start.updated(first_order=sign * slopes, second_order=sign * surface.second_order)
 
 
-def _sign_free_slopes(problem: Problem) -> np.ndarray:
+def log_units(jacobian: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """(F,) logarithms, mean 0, of the factors to a common unit of length, from what `_from_reference` gives.
+
+    In the common unit lengths show at most their true size in every image, and somewhere that size: an image that shows
+    all of them smaller than another image does is given a larger factor.
+    """
+    linked = reference == np.where(reference >= 0, reference, len(reference)).min(axis=1, keepdims=True)
+    unit = np.zeros(reference.shape[1])
+    for _ in range(_UNIT_ROUNDS):
+        shown = _shown(jacobian, linked, unit)
+        half = np.linalg.inv(np.linalg.cholesky(_least_above_all(shown)))[:, None]
+        largest = np.linalg.eigvalsh(half @ shown @ np.swapaxes(half, 2, 3))[..., 1]
+        for f, points in enumerate(linked.T):
+            unit[f] -= 0.5 * np.log(np.median(largest[points, f])) if points.any() else 0.0
+        unit -= unit.mean()
+    return unit
+
+
+def _sign_free_slopes(jacobian: np.ndarray, reference: np.ndarray, unit: np.ndarray) -> np.ndarray:
     """(P, F, 2) slopes, up to sign, of the smallest metric of each point that no image's exceeds."""
-    jacobian, reference = _from_reference(problem)
-    slopes = np.zeros((*problem.visible.shape, 2))
+    slopes = np.zeros((*reference.shape, 2))
     for r in np.unique(reference[reference >= 0]):
         linked = reference == r
         points = np.flatnonzero(linked.any(axis=1))
         linked = linked[points]
-        J = np.where(linked[..., None, None], jacobian[points], np.eye(2))
-        g = np.broadcast_to(np.eye(2), (len(points), 2, 2))
-        for f in range(problem.n_frames):
-            g = _least_above(g, np.swapaxes(J[:, f], 1, 2) @ J[:, f])
-        back = np.linalg.inv(J)
-        excess, axis = np.linalg.eigh(np.swapaxes(back, 2, 3) @ g[:, None] @ back - np.eye(2))
+        shown = _shown(jacobian[points], linked, unit)
+        back = np.linalg.inv(np.where(linked[..., None, None], jacobian[points], np.eye(2)))
+        own = _least_above_all(shown)[:, None] - shown
+        excess, axis = np.linalg.eigh(np.swapaxes(back, 2, 3) @ own @ back * np.exp(-2.0 * unit)[:, None, None])
         steepest = np.sqrt(np.maximum(excess[..., 1], _LEAST_SLOPE**2))[..., None] * axis[..., 1]
         slopes[points] = np.where(linked[..., None], steepest, slopes[points])
     return slopes
+
+
+def _shown(jacobian: np.ndarray, linked: np.ndarray, unit: np.ndarray) -> np.ndarray:
+    """(P, F, 2, 2) metrics over the reference that the images show in the common unit, tiny where not linked."""
+    J = np.where(linked[..., None, None], jacobian * np.exp(unit)[:, None, None], 1e-9 * np.eye(2))
+    return np.swapaxes(J, 2, 3) @ J
 
 
 def _from_reference(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
@@ -134,13 +167,16 @@ def _from_reference(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
     return jacobian, reference
 
 
-def _least_above(g: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """The least metrics (N, 2, 2) with the axes of both that exceed g and the other ones."""
-    L = np.linalg.cholesky(g)
-    half = np.linalg.inv(L)
-    size, axis = np.linalg.eigh(half @ other @ np.swapaxes(half, 1, 2))
-    root = L @ (axis * np.sqrt(np.maximum(size, 1.0))[:, None])
-    return root @ np.swapaxes(root, 1, 2)
+def _least_above_all(shown: np.ndarray) -> np.ndarray:
+    """(P, 2, 2) metrics that exceed those of all images (P, F, 2, 2), one after the other by as little as possible."""
+    g = shown.max(axis=(1, 2, 3))[:, None, None] * 1e-12 * np.eye(2)
+    for other in np.moveaxis(shown, 1, 0):
+        L = np.linalg.cholesky(g)
+        half = np.linalg.inv(L)
+        size, axis = np.linalg.eigh(half @ other @ np.swapaxes(half, 1, 2))
+        root = L @ (axis * np.sqrt(np.maximum(size, 1.0))[:, None])
+        g = root @ np.swapaxes(root, 1, 2)
+    return g
 
 
 def even_signs(image: np.ndarray, slopes: np.ndarray) -> np.ndarray:

@@ -294,7 +294,7 @@ def _record(
         costs["refinement"] = list(refined.cost_history)
         warnings += refined.warnings
     if not tracks.camera.kappa:
-        decisions["scale convention"] = "one unit of length for all images, as the intrinsics say"
+        decisions["scale convention"] = "each image is in the unit of length of its intrinsics"
         decisions["mirror images"] = "second fundamental forms agree, most of the surface bulges towards the camera"
     return RunRecord(
         source="",
