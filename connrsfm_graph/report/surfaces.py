@@ -56,9 +56,7 @@ class Surfaces:
         parts = []
         centre = np.zeros((len(points), 3))
         for f, frame in enumerate(points):
-            image = np.where(
-                known[f][:, None], reconstruction.points[f, :, :2] / reconstruction.points[f, :, 2:], np.nan
-            )
+            image = np.where(known[f][:, None], reconstruction.camera.image(reconstruction.points[f]), np.nan)
             parts.append(triangles(image))
             if known[f].any():
                 centre[f] = 0.5 * (frame[known[f]].min(axis=0) + frame[known[f]].max(axis=0))
