@@ -30,9 +30,9 @@ _ROUNDS = 3
 _HALVINGS = 2
 """How often the assumed length noise may be halved."""
 _RESTARTS = 4
-"""Rounds of restarts in the conformal model, at most."""
-CAUGHT = 3.0
-"""A view that costs this many times the median view may be caught in a wrong shape."""
+"""Rounds of restarts, at most."""
+_SUSPECT = (1.5, 0.02)
+"""So may one of an isometric fit that costs so many times the lower quartile of the views, and so much per edge."""
 _MISFIT = 1.0
 """Isometry is in doubt where its squared residuals exceed this many assumed variances on average."""
 _RATIO = 6.0
@@ -145,16 +145,20 @@ def fit(task: Task, sigma_image: float) -> Fit:
 
 
 def fit_isometric(task: Task, noise: Noise) -> Fit:
-    """Isometric fit from the start; views that cost far more than the others try other starts."""
+    """Isometric fit from the start; views that cost more than others try other starts until none gains."""
     measurements = task.measurements(noise)
     shape, history = _minimise(task, measurements, start_shape(task.completed, task.mesh))
-    cost = costs(measurements, shape, lag(measurements, shape))
-    caught = np.flatnonzero(cost > CAUGHT * np.median(cost))
-    if len(caught):
-        better, renewed = restart(measurements.views(caught), shape.views(caught))
-        if renewed.any():
-            shape, more = _minimise(task, measurements, shape.replaced(caught, better))
-            history += more
+    factor, per_edge = _SUSPECT
+    for _ in range(_RESTARTS):
+        cost = costs(measurements, shape, lag(measurements, shape))
+        suspect = np.flatnonzero(cost > max(factor * np.quantile(cost, 0.25), per_edge * len(task.mesh.edges)))
+        if len(suspect) == 0:
+            break
+        better, renewed = restart(measurements.views(suspect), shape.views(suspect))
+        if not renewed.any():
+            break
+        shape, more = _minimise(task, measurements, shape.replaced(suspect, better))
+        history += more
     return _settled(task, Fit(measurements, shape, noise, history, history[-1]))
 
 

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from connrsfm_graph.refine.config import RefineConfig
-from connrsfm_graph.refine.fit import CAUGHT, Fit
+from connrsfm_graph.refine.fit import Fit
+from connrsfm_graph.refine.resection import moved_rigidly
 from connrsfm_graph.refine.restarts import inverted, restart
 from connrsfm_graph.refine.solve import Measurements, Shape, costs, fit_views, lag
 from connrsfm_graph.refine.uncertainty import log_depth_deviation
@@ -21,6 +22,10 @@ from connrsfm_graph.refine.wrong_tracks import wrong_tracks
 
 _ATTEMPTS = 3
 """Fits of a view without the tracks that the one before has shown to be wrong."""
+_CAUGHT = (3.0, 0.02)
+"""A view that costs so many times the median fitted view, and so much per edge, may be caught in a wrong shape."""
+_TOLERANCE = 0.01
+"""A view's fit ends where an iteration gains less than this part."""
 
 
 @dataclass(frozen=True)
@@ -129,8 +134,10 @@ def _fitted(
 ) -> tuple[Measurements, Shape]:
     """Measurements of views that see the trusted points `seen`, and the shape that fits them."""
     fit = reference.fit
-    start = fit.shape.views(nearest)
     image, deviation = complete_images(image, seen, reference.template)
+    held = fit.shape.views(nearest)
+    surface = moved_rigidly(fit.shape.points(fit.measurements.image)[nearest], image, seen)
+    start = Shape(np.log(surface[..., 2]), np.zeros_like(image), held.log_factor, held.log_length)
     B, E = len(seen), len(fit.measurements.mesh.edges)
     measurements = Measurements(
         image=image,
@@ -141,9 +148,9 @@ def _fitted(
         mesh=fit.measurements.mesh,
         weights=fit.measurements.weights,
     )
-    start = Shape(start.log_depth, np.zeros_like(image), start.log_factor, start.log_length)
-    shape, cost = fit_views(measurements, start, config.iterations, config.tolerance)
-    caught = np.flatnonzero(cost > CAUGHT * reference.typical_cost())
+    shape, cost = fit_views(measurements, start, config.iterations, _TOLERANCE)
+    factor, per_edge = _CAUGHT
+    caught = np.flatnonzero(cost > max(factor * reference.typical_cost(), per_edge * E))
     if len(caught):
         better, _ = restart(measurements.views(caught), shape.views(caught))
         shape = shape.replaced(caught, better)

@@ -18,6 +18,8 @@ Progress = Callable[[str], None]
 
 _DAMPING = (1e-3, 1e-7, 1e6)
 """First, smallest and largest damping."""
+_EXACT = 1e-6
+"""Mean squared length residual, in assumed variances, below which the data are exact and nothing is left to gain."""
 _INNER_TOLERANCE = 0.2
 """Relative accuracy of the conjugate gradients: what they leave the next iteration corrects, as it does curvature."""
 
@@ -224,7 +226,7 @@ def minimise(measurements: Measurements, shape: Shape, iterations: int, toleranc
         shape = trial
         lagged = lag(measurements, shape)
         history.append(after)
-        if before - after <= tolerance * before:
+        if before - after <= tolerance * before or after <= 0.5 * _EXACT * measurements.length_weight.size:
             break
     return shape, history
 
@@ -249,7 +251,8 @@ def fit_views(measurements: Measurements, shape: Shape, iterations: int, toleran
         better = after <= before
         shape = shape.replaced(active, start.with_views(better, trial))
         damping[active] = np.clip(damping[active] * np.where(better, 0.1, 10.0), _DAMPING[1], _DAMPING[2])
-        active = active[~better | (before - after > tolerance * before)]
+        exact = after <= 0.5 * _EXACT * measurements.length_weight.shape[1]
+        active = active[~better | ((before - after > tolerance * before) & ~exact)]
         if len(active) == 0:
             break
     return shape, costs(measurements, shape, lag(measurements, shape))
