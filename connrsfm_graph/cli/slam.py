@@ -13,8 +13,12 @@ from typing import TYPE_CHECKING
 from connrsfm_graph.cli.settings import add_configuration, resolved
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from connrsfm_graph.progress import Progress
     from connrsfm_graph.reconstruction import Reconstruction
+    from connrsfm_graph.slam import Fused, FusionProblem, SlamConfig
+    from connrsfm_graph.tracks import Tracks
 
 TRAJECTORY_FILE, MAP_FILE, PROBLEM_FILE = "trajectory.tum", "map.ply", "problem.npz"
 
@@ -45,6 +49,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="position",
         help="what of a map point changes little from view to view (default: %(default)s)",
     )
+    parser.add_argument(
+        "--live",
+        type=int,
+        metavar="N",
+        help="reconstruct the first N views together and take in the others one by one (default: all together)",
+    )
     parser.add_argument("--intrinsics", metavar="K", help="camera of the tracks, instead of the file's own")
     add_configuration(parser)
 
@@ -55,18 +65,8 @@ def run(arguments: argparse.Namespace) -> None:
     from connrsfm_graph.errors import InputError
     from connrsfm_graph.files import check_output_folder, folder_written_beside
     from connrsfm_graph.progress import Progress
-    from connrsfm_graph.slam import (
-        FusionConfig,
-        MapModel,
-        Sightings,
-        SlamConfig,
-        pose_problem,
-        read_tum,
-        save_problem,
-        solve_problem,
-        write_map,
-        write_tum,
-    )
+    from connrsfm_graph.slam import FusionConfig, MapModel, SlamConfig, read_tum, save_problem, write_map, write_tum
+    from connrsfm_graph.slam.cameras import STANDSTILL
     from connrsfm_graph.slam.trajectory import steps_between
     from connrsfm_graph.tracks import load_tracks
 
@@ -74,40 +74,85 @@ def run(arguments: argparse.Namespace) -> None:
     config = SlamConfig(
         FusionConfig(MapModel(motion=arguments.motion)), arguments.odometry_translation, arguments.odometry_rotation
     )
+    tracks = load_tracks(arguments.tracks, arguments.intrinsics)
     times, odometry = (None, None) if arguments.odometry is None else read_tum(arguments.odometry)
-    background = None
-    if arguments.background is not None:
-        tracked = load_tracks(arguments.background, arguments.intrinsics)
-        background = np.nan_to_num(tracked.normalised()), tracked.visible
+    if odometry is not None and len(odometry) != tracks.n_frames:
+        raise InputError(f"{arguments.odometry}: holds {len(odometry)} poses, expected one per view, {tracks.n_frames}")
+    steps, first = (None, None) if odometry is None else (steps_between(odometry), odometry[0])
     progress = Progress()
-    sightings = Sightings.of(_reconstruction(arguments, progress))
-    if odometry is not None and len(odometry) != sightings.n_views:
-        raise InputError(
-            f"{arguments.odometry}: holds {len(odometry)} poses, expected one per view, {sightings.n_views}"
-        )
-    with progress.stage("noise levels"):
-        steps = None if odometry is None else steps_between(odometry)
-        first = None if odometry is None else odometry[0]
-        problem = pose_problem(sightings, config, None, steps, background, first)
-    with progress.stage("fusion"):
-        fused = solve_problem(problem, config.fusion, progress.update)
+    fusion = _all_together if arguments.live is None else _live
+    problem, fused = fusion(arguments, tracks, config, steps, first, progress)
     with folder_written_beside(out) as part:
         write_tum(part / TRAJECTORY_FILE, fused.poses, times)
         write_map(part / MAP_FILE, fused)
         save_problem(part / PROBLEM_FILE, problem)
-    unit = "of odometry" if odometry is not None else "of the first view's reconstruction"
+    moved = steps is not None and bool(np.linalg.norm(steps[:, :3, 3], axis=1).max(initial=0.0) > STANDSTILL)
+    unit = "of odometry" if moved else "of the first view's reconstruction"
     print(f"{len(fused.poses)} poses and {np.isfinite(fused.points).all(axis=-1).sum()} map points, in the unit {unit}")
     print(f"{out}: {TRAJECTORY_FILE}, {MAP_FILE}, {PROBLEM_FILE}")
 
 
-def _reconstruction(arguments: argparse.Namespace, progress: Progress) -> Reconstruction:
+def _all_together(
+    arguments: argparse.Namespace,
+    tracks: Tracks,
+    config: SlamConfig,
+    steps: np.ndarray | None,
+    first: np.ndarray | None,
+    progress: Progress,
+) -> tuple[FusionProblem, Fused]:
+    """All views are reconstructed, then fused."""
+    import numpy as np
+
+    from connrsfm_graph.slam import Sightings, pose_problem, solve_problem
+    from connrsfm_graph.tracks import load_tracks
+
+    background = None
+    if arguments.background is not None:
+        tracked = load_tracks(arguments.background, arguments.intrinsics)
+        background = np.nan_to_num(tracked.normalised()), tracked.visible
+    sightings = Sightings.of(_reconstruction(arguments, tracks, progress))
+    with progress.stage("noise levels"):
+        problem = pose_problem(sightings, config, None, steps, background, first)
+    with progress.stage("fusion"):
+        return problem, solve_problem(problem, config.fusion, progress.update)
+
+
+def _live(
+    arguments: argparse.Namespace,
+    tracks: Tracks,
+    config: SlamConfig,
+    steps: np.ndarray | None,
+    first: np.ndarray | None,
+    progress: Progress,
+) -> tuple[FusionProblem, Fused]:
+    """The first views are reconstructed together, the others come one by one; all are let go of in the end."""
+    import numpy as np
+
+    from connrsfm_graph.errors import InputError
+    from connrsfm_graph.slam import FusionProblem, Sightings, fuse_live
+
+    if not 3 <= arguments.live <= tracks.n_frames:
+        raise InputError(f"--live is {arguments.live}, expected 3 to {tracks.n_frames}, the number of views")
+    if arguments.background is not None:
+        raise InputError("--background cannot be used with --live; leave one of them out")
+    known = Sightings.of(_reconstruction(arguments, tracks.select(frames=range(arguments.live)), progress))
+    with progress.stage("views"):
+        live = fuse_live(
+            known, np.nan_to_num(tracks.normalised()), tracks.visible, config, steps, first, progress.update
+        )
+    with progress.stage("fusion"):
+        fused = live.fusion.finish()
+    sightings, model = live.fusion.map.sightings(), config.fusion.map
+    return FusionProblem(sightings, live.fusion.noise, model, live.fusion.graph, live.fusion.values), fused
+
+
+def _reconstruction(arguments: argparse.Namespace, tracks: Tracks, progress: Progress) -> Reconstruction:
     """The one given, or one made now."""
     from connrsfm_graph.errors import InputError
     from connrsfm_graph.methods import METHODS
     from connrsfm_graph.reconstruction import Reconstruction
-    from connrsfm_graph.tracks import check_reconstructable, load_tracks
+    from connrsfm_graph.tracks import check_reconstructable
 
-    tracks = load_tracks(arguments.tracks, arguments.intrinsics)
     if arguments.result is not None:
         loaded = Reconstruction.load(arguments.result)
         if loaded.visible.shape != tracks.visible.shape:

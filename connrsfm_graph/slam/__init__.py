@@ -4,6 +4,7 @@ from connrsfm_graph.slam.assemble import MapModel, add_reconstruction, pose_key
 from connrsfm_graph.slam.fuse import Fused, FusionConfig, fuse
 from connrsfm_graph.slam.incremental import IncrementalConfig, IncrementalFusion
 from connrsfm_graph.slam.keyframes import KeyframeConfig, Keyframes
+from connrsfm_graph.slam.live import LiveFusion, fuse_live
 from connrsfm_graph.slam.noise import FusionNoise, estimate_noise
 from connrsfm_graph.slam.run import SlamConfig, pose_problem, solve_problem
 from connrsfm_graph.slam.sightings import Sightings, View
@@ -19,6 +20,7 @@ __all__ = [
     "IncrementalFusion",
     "KeyframeConfig",
     "Keyframes",
+    "LiveFusion",
     "MapModel",
     "Sightings",
     "SlamConfig",
@@ -27,6 +29,7 @@ __all__ = [
     "add_reconstruction",
     "estimate_noise",
     "fuse",
+    "fuse_live",
     "load_problem",
     "pose_key",
     "pose_problem",

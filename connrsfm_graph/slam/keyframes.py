@@ -1,36 +1,25 @@
-"""Depth of a new view from pair factors against keyframes, when views arrive one by one.
+"""Keyframes: which of the views that arrive one by one are kept, and to which ones a new view is related.
 
 The image graph grows greedily: a new view is joined to the keyframe it shares most tracks with, as a maximum spanning
 tree would, and then to those that add most to log det of the graph's Laplacian, which is the edge's weight times the
 effective resistance between its ends. Only the resistances among the keyframes are kept; forgetting an old keyframe
 means dropping its row and column of the inverse, and changes none of the others.
 
-The isometric pair factors of the new view and its keyframes give first-order terms, these are integrated, and the unit
-is that of the keyframes' depths. The work per view is bounded by the number of edges. Keyframes must differ: from views
-that are nearly the same nothing is learnt about depth.
+The work per view is bounded by the numbers of edges and of keyframes. Keyframes must differ: from views that are nearly
+the same nothing is learnt about depth (`new_view`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-import gtsam
 import numpy as np
 
 from connrsfm_graph.errors import InputError
 from connrsfm_graph.image_graph import image_change
-from connrsfm_graph.initialise import with_closed_form_scale
-from connrsfm_graph.integrate import integrate, terms_of_depth
-from connrsfm_graph.problem import Problem, State, flat_state, make_problem
-from connrsfm_graph.slam.sightings import View, stacked
-from connrsfm_graph.solvers.gtsam_backend import levenberg_marquardt, point_graph
-from connrsfm_graph.solvers.interface import PairModel
-from connrsfm_graph.warps import WarpConfig, fit_warps
-from factors.keys import FIRST_ORDER, decode, key
-from factors.noise import PairNoise
-
-_HELD = 0.1
-"""Standard deviation of the first-order terms of keyframes: they are estimates too."""
+from connrsfm_graph.slam.new_view import from_lengths, from_pairs
+from connrsfm_graph.slam.sightings import View
+from connrsfm_graph.warps import WarpConfig
 
 
 @dataclass(frozen=True)
@@ -49,6 +38,11 @@ class KeyframeConfig:
     """The oldest keyframe is forgotten beyond this many."""
     warps: WarpConfig = field(default_factory=lambda: WarpConfig(model="gaussian_process", covariance=False))
     """Image warps between a new view and its keyframes."""
+
+    image_sigma: float = 1e-3
+    """Standard deviation of a coordinate of the image points, normalised coordinates."""
+    length_sigma: float = 0.01
+    """Standard deviation of a log length in one view, as in the refinement."""
 
     def __post_init__(self) -> None:
         if self.edges < 1 or self.most < self.edges:
@@ -95,43 +89,21 @@ class Keyframes:
         return True
 
     def depths(self, points: np.ndarray, image: np.ndarray) -> View:
-        """Depths of a new view from pair factors against its keyframes.
+        """Depths of a new view from its pairs with keyframes and the lengths that all of them show.
 
         Args:
             points: (N,) numbers of the points seen, each once.
             image: (N, 2) normalised image coordinates.
 
         Returns:
-            The points of the view whose depth its pairs determine, in the keyframes' unit.
+            These points on corrected sight rays, in the keyframes' unit; new ones on the surface through the others.
 
         Raises:
-            InputError: no keyframe shares enough points, or no point has a usable pair.
+            InputError: no keyframe shares enough points, or too few pairs are usable.
         """
         new = View.checked(points, image, np.zeros(len(points)))
-        related = [self.views[k] for k in self.select(new.points)]
-        views = [*related, new]
-        numbers = np.unique(np.concatenate([view.points for view in views]))
-        local = stacked(views, [np.arange(len(view.points)) for view in views], numbers)
-        last = len(related)
-        edges = np.array([[k, last] for k in range(last)])
-        warps = fit_warps(local.image, local.seen, edges, self.config.warps)
-        problem = make_problem(local.image, local.seen, edges, warps.jets, warps.weight * warps.valid)
-        if not (problem.weight > 0).any():
-            raise InputError("no pair of the view with a keyframe is usable")
-        first, second, _ = terms_of_depth(local.image, local.log_depth, local.seen, problem.camera)
-        state = flat_state(problem).updated(
-            first_order=np.swapaxes(first, 0, 1), second_order=np.swapaxes(second, 0, 1)
-        )
-        state = _solved(problem, state, last)
-        integrated = integrate(problem, state)
-        local_depth = np.where(np.arange(last + 1) < last, local.log_depth.T, integrated.log_depth)
-        noise = PairNoise(extrinsic=np.inf)
-        state = with_closed_form_scale(problem, state.updated(log_depth=local_depth), noise)
-        # The median conformal scale of the view's pairs is 1 in the keyframes' unit.
-        unit = float(np.median(state.log_scale[problem.weight > 0]))
-        column = np.searchsorted(numbers, new.points)
-        known = problem.constrained()[column, last]
-        return View.checked(new.points[known], new.image[known], integrated.log_depth[column[known], last] + unit)
+        start = from_pairs(new, [self.views[k] for k in self.select(new.points)], self.config.warps)
+        return from_lengths(start, self.views, self.config.image_sigma, self.config.length_sigma)
 
     def _is_news(self, view: View) -> bool:
         newest = self.views[-1]
@@ -164,19 +136,3 @@ class Keyframes:
             chosen.append(k)
             left[k] = 0.0
         return chosen, G
-
-
-def _solved(problem: Problem, state: State, new: int) -> State:
-    """First-order terms of view `new` from the isometric pair factors of every point, those of the others held."""
-    first_order = state.first_order.copy()
-    held = gtsam.noiseModel.Isotropic.Sigma(2, _HELD)
-    for point in np.flatnonzero((problem.weight > 0).any(axis=1)).tolist():
-        graph, values = point_graph(problem, state, point, ("d",), PairNoise(), PairModel.ISOMETRIC)
-        for k in values.keys():
-            if decode(k)[2] != new:
-                graph.add(gtsam.PriorFactorVector(k, values.atVector(k), held))
-        mine = key(FIRST_ORDER, point, new)
-        values.update(mine, np.mean([values.atVector(k) for k in values.keys() if k != mine], axis=0))
-        solved, _, _ = levenberg_marquardt(graph, values)
-        first_order[point, new] = solved.atVector(mine)
-    return state.updated(first_order=first_order)
