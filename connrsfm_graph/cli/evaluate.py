@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -74,8 +75,10 @@ def evaluated(reconstruction: Reconstruction, truth: Tracks, source: str) -> tup
 
 def summary(evaluation: Evaluation) -> str:
     """The figures of the field in one line."""
+    shape = evaluation.shape_error_deg
     return (
-        f"3D error {evaluation.e3d_percent:.3f} %, shape error {evaluation.shape_error_deg:.2f} degrees, "
+        f"3D error {evaluation.e3d_percent:.3f} %, "
+        f"shape error {'unknown' if math.isnan(shape) else f'{shape:.2f} degrees'}, "
         f"3D RMSE {evaluation.rmse_3d_percent:.3f} % of the extent, coverage {100 * evaluation.coverage:.1f} %"
     )
 

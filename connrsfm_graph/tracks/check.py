@@ -98,7 +98,7 @@ def _hide_coincident(tracks: Tracks) -> tuple[Tracks, list[str]]:
 def _hide_wild(tracks: Tracks) -> tuple[Tracks, list[str]]:
     visible = tracks.visible.copy()
     for seen, points in zip(visible, tracks.pixels, strict=True):
-        distance = np.linalg.norm(points - np.median(points[seen], axis=0), axis=1)
+        distance = np.hypot(*(points - np.median(points[seen], axis=0)).T)
         seen &= ~(distance > _WILD * np.median(distance[seen]))
     wild = np.argwhere(tracks.visible & ~visible)
     if not len(wild):

@@ -129,8 +129,30 @@ def test_record_round_trip(tmp_path: Path) -> None:
     assert RunRecord.load(tmp_path / "run.json") == read
 
 
+def test_figures_that_are_no_numbers_read_back_as_such(tmp_path: Path) -> None:
+    nan = float("nan")
+    record = RunRecord("a", "b", 0, cost_history={"x": [nan, 1.0]}, seconds={"y": nan}, peak_memory_mib=nan)
+    record.save(tmp_path / "run.json")
+    read = RunRecord.load(tmp_path)
+    np.testing.assert_array_equal(read.cost_history["x"], [nan, 1.0])
+    np.testing.assert_array_equal([read.seconds["y"], read.peak_memory_mib], [nan, nan])
+
+
 @pytest.mark.parametrize(
-    ("text", "message"), [("{", "not a JSON file"), ("[]", "holds no JSON object"), ("{}", "key 'source' is missing")]
+    ("text", "message"),
+    [
+        ("{", "not a JSON file"),
+        ("[]", "holds no JSON object"),
+        ("{}", "key 'source' is missing"),
+        ('{"source": "a", "method": "b", "seed": "c"}', "'seed' is not a whole number"),
+        ('{"source": "a", "method": "b", "seed": 0, "warnings": 7}', "'warnings' is not a list of sentences"),
+        ('{"source": "a", "method": "b", "seed": 0, "decisions": []}', "'decisions' is not a table of decisions"),
+        (
+            '{"source": "a", "method": "b", "seed": 0, "cost_history": {"x": 3}}',
+            "'cost_history' is not a table of lists",
+        ),
+        ('{"source": "a", "method": "b", "seed": 0, "seconds": {"x": "long"}}', "'seconds' is not a table of numbers"),
+    ],
 )
 def test_bad_record_is_named(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "run.json").write_text(text)

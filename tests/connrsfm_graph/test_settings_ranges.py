@@ -29,9 +29,18 @@ from connrsfm_graph.reconstruct import Config
         "warps.min_points=1",
         "refine.length_sigma=-1",
         "refine.rings=7",
+        "refine.length_sigma=inf",
+        "refine.tolerance=inf",
+        "refine.tolerance=nan",
+        "refine.iterations=0",
+        "graph.complete_up_to=-1",
+        "solve.noise.metric=inf",
+        "solve.noise.huber=nan",
+        "solve.noise.intrinsic=-2",
+        "seed=-1",
     ],
 )
 def test_out_of_range(assignment: str) -> None:
-    name = assignment.split("=")[0].rsplit(".", 1)[1]
-    with pytest.raises(InputError, match=name):
+    name = assignment.split("=")[0].rsplit(".", 1)[-1]
+    with pytest.raises(InputError, match=f"^--set .*{name}"):
         override(Config(), [assignment])

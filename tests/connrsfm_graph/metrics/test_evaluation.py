@@ -86,6 +86,16 @@ def test_own_normals_are_judged_in_the_aligned_frame(truth: np.ndarray) -> None:
     assert evaluate(truth, truth).normal_error_deg is None
 
 
+def test_true_normals_without_length_are_unknown(truth: np.ndarray) -> None:
+    """An angle with nothing is no perfect angle."""
+    bent = truth + 0.3 * truth[..., :1] ** 3 * [0.0, 0.0, 1.0]
+    assert np.isnan(evaluate(bent, truth, true_normals=np.zeros_like(truth)).shape_error_deg)
+    some = np.zeros_like(truth)
+    some[:, ::2] = [0.0, 0.0, -1.0]
+    known = evaluate(bent[:, ::2], truth[:, ::2], true_normals=some[:, ::2]).shape_error_deg
+    assert known == pytest.approx(evaluate(bent, truth, true_normals=some).shape_error_deg, rel=0.2)
+
+
 def test_to_dict_is_json_without_nan(truth: np.ndarray) -> None:
     unknown = np.full_like(truth, np.nan)
     text = json.dumps(evaluate(truth, truth, true_normals=unknown).to_dict(), allow_nan=False)

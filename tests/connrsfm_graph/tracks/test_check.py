@@ -46,6 +46,28 @@ def test_real_tracks_pass(realdata, name: str) -> None:
     assert warnings == ()
 
 
+@pytest.mark.parametrize("where", [1e12, -1e300])
+def test_a_wild_observation_is_left_out(where: float) -> None:
+    """It would make all others a point, and the image a line."""
+    pixels = views()
+    pixels[2, 7] = [where, 10.0]
+    tracks, warnings = check(pixels)
+    assert not tracks.visible[2, 7]
+    assert tracks.visible.sum() == tracks.visible.size - 1
+    (warning,) = warnings
+    assert warning.startswith(
+        "1 observations lie far outside the others of their image (the first is point 7 of image 2"
+    )
+
+
+def test_images_are_called_by_their_names() -> None:
+    pixels = views()
+    pixels[3, :, 1] = 5.0
+    tracks = Tracks.checked(pixels, K, image_names=[f"frame {10 * n}" for n in range(6)])
+    with pytest.raises(InputError, match="all points of frame 30 lie on one line"):
+        check_reconstructable(tracks)
+
+
 def test_too_few_images_and_points() -> None:
     with pytest.raises(InputError, match=r"a\.npz: shows 2 images, expected at least 3 because"):
         check(views(2))

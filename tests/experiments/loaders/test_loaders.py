@@ -13,6 +13,7 @@ from connrsfm_graph.synthetic import isometric_bending
 from connrsfm_graph.tracks import Tracks, load_tracks
 from experiments.loaders import datasets
 from experiments.loaders.__main__ import main
+from factors.surface import ORTHOGRAPHIC
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +66,15 @@ def test_a_small_file_of_the_layout_is_read(name: str, tmp_path: Path, tracks: T
     np.testing.assert_allclose(loaded.points, tracks.points)
 
 
+def test_sequences_of_the_challenge_without_a_camera_are_orthographic(tmp_path: Path) -> None:
+    truth = isometric_bending(n_frames=3, n_points=12, camera=ORTHOGRAPHIC).tracks.points
+    savemat(tmp_path / "seq.mat", {"W": by_image(truth[..., :2]), "GT": by_image(truth)})
+    loaded = datasets()["nrsfm_challenge"].load(tmp_path)
+    assert loaded.camera is ORTHOGRAPHIC
+    np.testing.assert_allclose(loaded.normalised(), truth[..., :2])
+    np.testing.assert_allclose(loaded.points, truth)
+
+
 def test_every_data_set_says_where_it_is_to_be_had(capsys: pytest.CaptureFixture[str]) -> None:
     assert set(datasets()) == {*WRITERS, "mandala", "hamlyn", "cloth_r1"}
     assert main([]) == 0
@@ -103,7 +113,7 @@ def test_depth_maps_give_the_truth_of_tracked_points(name: str, tmp_path: Path) 
         ("rug", None, "holds 0 files '\\*.mat', expected one"),
         ("nrsfm_challenge", {"GT": np.zeros((6, 4))}, "field 'W' is missing"),
         ("nrsfm_challenge", {"W": np.zeros((3, 4)), "K": np.eye(3)}, r"'W' has shape \(3, 4\), expected 2 rows per"),
-        ("nrsfm_challenge", {"W": np.zeros((4, 4))}, "field 'K' is missing"),
+        ("dense_paper", {"W": np.zeros((4, 4))}, "field 'K' is missing"),
         ("kinect_paper_full", {"p": 1}, "KinectPaper.mat: no such file"),
     ],
 )
