@@ -22,7 +22,7 @@ from connrsfm_graph.refine.curvature import shear_kernel
 from connrsfm_graph.refine.mesh import Mesh
 from connrsfm_graph.refine.restarts import inverted
 from connrsfm_graph.refine.solve import Shape
-from connrsfm_graph.refine.threads import over_views
+from connrsfm_graph.threads import over_views
 
 _ISOMETRIC = 0.005
 """Two views are isometric where the standard deviation of their difference in log conformal factor is below this."""

@@ -20,7 +20,7 @@ import numpy as np
 from numba import njit
 
 from connrsfm_graph.errors import ComputationError
-from connrsfm_graph.refine.threads import over_views
+from connrsfm_graph.threads import over_views
 
 
 class Envelope(NamedTuple):

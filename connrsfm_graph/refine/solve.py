@@ -12,7 +12,7 @@ from connrsfm_graph.refine.cost import Terms, Weights, cost_kernel, hinge_stenci
 from connrsfm_graph.refine.curvature import arc_offset_kernel
 from connrsfm_graph.refine.elimination import Envelope, Factorised, NormalEquations, make_envelope
 from connrsfm_graph.refine.mesh import Mesh
-from connrsfm_graph.refine.threads import over_views
+from connrsfm_graph.threads import over_views
 
 Progress = Callable[[str], None]
 

@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from scipy.spatial import cKDTree
 
-from connrsfm_graph.refine.threads import over_views
+from connrsfm_graph.threads import over_views
 
 _NEIGHBOURS = 12
 """Points from which a position is predicted, at most; at least half as many."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from connrsfm_graph.errors import InputError
+from connrsfm_graph.threads import mapped
 from connrsfm_graph.warps.config import WarpConfig
 from connrsfm_graph.warps.fitted import FittedWarp
 from connrsfm_graph.warps.normalise import LocalCoordinates, jet_from_local
@@ -102,30 +103,50 @@ def fit_warps(
     reports = []
     if not is_resolved(config):
         config = resolve(config, _probes(image, visible, edges, config))
-    for e, (a, b) in enumerate(edges):
+
+    def fitted(edge: np.ndarray) -> tuple[np.ndarray, _Fitted | str]:
+        a, b = edge
         shared = np.flatnonzero(visible[a] & visible[b])
-        problem = _problem(image[a, shared], image[b, shared], config)
-        if problem is not None:
-            reports.append(WarpReport(len(shared), "", problem=problem))
+        return shared, _problem(image[a, shared], image[b, shared], config) or _fit(image[:, shared], edge, config)
+
+    for e, (shared, found) in enumerate(mapped(fitted, edges)):
+        if isinstance(found, str):
+            reports.append(WarpReport(len(shared), "", problem=found))
         else:
-            local_a, local_b = LocalCoordinates.of(image[a, shared]), LocalCoordinates.of(image[b, shared])
-            probe = _probe(image[a, shared], image[b, shared], config)
-            points, _, process = probe
-            warp = fit_model(config, probe)
-            jet = jet_from_local(warp.jet(points, config.covariance), local_a, local_b)
-            folded = np.linalg.det(jet.jacobian) <= 0.0
-            report = _report(warp, folded, local_b.spread)
-            reports.append(report)
-            noise[e], residual[e] = process.noise * local_b.spread, report.residual
-            weight[e, shared] = warp.weight
-            valid[e, shared] = report.usable & ~folded
-            jets.value[e, shared], jets.jacobian[e, shared] = jet.value, jet.jacobian
-            jets.hessian[e, shared] = jet.hessian
-            if jets.covariance is not None and jet.covariance is not None:
-                jets.covariance[e, shared] = jet.covariance
+            reports.append(found.report)
+            noise[e], residual[e] = found.noise, found.report.residual
+            weight[e, shared] = found.weight
+            valid[e, shared] = found.report.usable & ~found.folded
+            jets.value[e, shared], jets.jacobian[e, shared] = found.jet.value, found.jet.jacobian
+            jets.hessian[e, shared] = found.jet.hessian
+            if jets.covariance is not None and found.jet.covariance is not None:
+                jets.covariance[e, shared] = found.jet.covariance
         if progress is not None:
             progress(e + 1, E)
     return Warps(edges, jets, valid, weight, noise, residual, tuple(reports), config)
+
+
+@dataclass(frozen=True)
+class _Fitted:
+    """The warp of one edge at its shared points, normalised image coordinates."""
+
+    report: WarpReport
+    jet: WarpJet
+    weight: np.ndarray
+    folded: np.ndarray
+    noise: float
+
+
+def _fit(image: np.ndarray, edge: np.ndarray, config: WarpConfig) -> _Fitted:
+    """The warp between two images of the points that both see, (F, N, 2)."""
+    a, b = edge
+    local_a, local_b = LocalCoordinates.of(image[a]), LocalCoordinates.of(image[b])
+    probe = _probe(image[a], image[b], config)
+    points, _, process = probe
+    warp = fit_model(config, probe)
+    jet = jet_from_local(warp.jet(points, config.covariance), local_a, local_b)
+    folded = np.linalg.det(jet.jacobian) <= 0.0
+    return _Fitted(_report(warp, folded, local_b.spread), jet, warp.weight, folded, process.noise * local_b.spread)
 
 
 def _checked(image: np.ndarray, visible: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -111,26 +111,55 @@ def fit_gaussian_process(
     Args:
         points, target: (P, 2) in image a and in image b, both of about unit spread; at least 4 points.
         weight: (P,) in (0, 1], inverse noise variances relative to the common one.
-        scales: (S,) increasing length scales to consider, S > 1; the best is refined between its neighbours.
+        scales: (S,) increasing length scales to consider, S > 1; those between them are tried as well.
     """
     if len(points) >= _MIN_POINTS_HOMOGRAPHY:
         homography = fit_homography(points, target, weight)
     else:
         homography = Homography(np.zeros((2, 2)), np.zeros(2), np.zeros(2))
     rest = target - homography.jet(points).value
+    fine = np.sort(np.concatenate([scales, np.sqrt(scales[:-1] * scales[1:])]))
+    data = _Data.of(points, rest, weight)
+    at = None
     for tolerance in (_TOLERANCE, _FINE_TOLERANCE):
-
-        def best_of(candidates: np.ndarray, tolerance: float = tolerance) -> _Evidence:
-            posteriors = (_Evidence.of(points, rest, weight, float(scale), tolerance) for scale in candidates)
-            return max(posteriors, key=lambda posterior: posterior.log_evidence)
-
-        best = best_of(scales)
-        between = np.sqrt(scales[:-1] * scales[1:])
-        at = int(np.searchsorted(scales, best.scale))
-        best = max(best, best_of(between[max(at - 1, 0) : at + 1]), key=lambda posterior: posterior.log_evidence)
+        at, best = _highest_evidence(data, fine, tolerance, at)
         if best.ratio > 1e3 * tolerance:
             break
     return best.warp(points, rest, weight, homography)
+
+
+def _highest_evidence(data: _Data, scales: np.ndarray, tolerance: float, near: int | None) -> tuple[int, _Evidence]:
+    """Index of the best length scale and its posterior: from every fourth scale, or from one known to be near, finer
+    and finer about the best."""
+    tried: dict[int, _Evidence] = {}
+    candidates = list(range(0, len(scales), 4)) if near is None else [near]
+    for reach in (2, 1, 0):
+        for index in candidates:
+            if 0 <= index < len(scales) and index not in tried:
+                tried[index] = _Evidence.of(data, float(scales[index]), tolerance)
+        best = max(tried, key=lambda index: tried[index].log_evidence)
+        candidates = [best - reach, best + reach]
+    return best, tried[best]
+
+
+@dataclass(frozen=True)
+class _Data:
+    """What does not depend on the length scale."""
+
+    points: np.ndarray
+    root: np.ndarray
+    """(P, 1) square roots of the weights."""
+    affine: np.ndarray
+    """(P, 3) orthonormal basis of the weighted affine functions."""
+    rest: np.ndarray
+    """(P, 2) weighted residuals of the homography without their affine part."""
+
+    @staticmethod
+    def of(points: np.ndarray, rest: np.ndarray, weight: np.ndarray) -> _Data:
+        root = np.sqrt(weight)[:, None]
+        affine = np.linalg.qr(root * np.column_stack([np.ones(len(points)), points]))[0]
+        rest = root * rest
+        return _Data(points, root, affine, rest - affine @ (affine.T @ rest))
 
 
 @dataclass(frozen=True)
@@ -149,15 +178,11 @@ class _Evidence:
     """(R, 2) projections of the weighted points on the eigenfeatures."""
 
     @staticmethod
-    def of(points: np.ndarray, rest: np.ndarray, weight: np.ndarray, scale: float, tolerance: float) -> _Evidence:
-        root = np.sqrt(weight)[:, None]
+    def of(given: _Data, scale: float, tolerance: float) -> _Evidence:
+        points, data = given.points, given.rest
         features, pivots = _pivoted_cholesky(points, scale, tolerance, min(len(points), _MAX_FEATURES))
-        affine = np.linalg.qr(root * np.column_stack([np.ones(len(points)), points]))[0]
-
-        def without_affine(columns: np.ndarray) -> np.ndarray:
-            return columns - affine @ (affine.T @ columns)
-
-        reduced, data = without_affine(root * features), without_affine(root * rest)
+        reduced = given.root * features
+        reduced -= given.affine @ (given.affine.T @ reduced)
         eigenvalues, eigenvectors = np.linalg.eigh(reduced.T @ reduced)
         eigenvalues = np.maximum(eigenvalues, 0.0)
         coefficients = eigenvectors.T @ (reduced.T @ data)
@@ -209,7 +234,7 @@ class _Evidence:
         )
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _pivoted_cholesky(points: np.ndarray, scale: float, tolerance: float, most: int) -> tuple[np.ndarray, np.ndarray]:
     """Features (P, R) of the unit-amplitude kernel on the points, and the points (R,) they are centred on.
 
