@@ -39,12 +39,13 @@ class Photo:
         return f"data:image/jpeg;base64,{base64.b64encode(data.tobytes()).decode()}"
 
 
-def photos_of(images: Iterable[np.ndarray], pixels: np.ndarray) -> list[Photo]:
+def photos_of(images: Iterable[np.ndarray], pixels: np.ndarray, longest: int = LONGEST) -> list[Photo]:
     """One photo per image, all of the same part of the picture.
 
     Args:
         images: F images (H, W[, 3]) uint8 RGB; each is read once and not kept.
         pixels: (F, P, 2) tracks, NaN where not visible.
+        longest: longest side in pixels.
     """
     lower, upper = np.nanmin(pixels, axis=(0, 1)), np.nanmax(pixels, axis=(0, 1))
     margin = _MARGIN * (upper - lower).max()
@@ -55,7 +56,7 @@ def photos_of(images: Iterable[np.ndarray], pixels: np.ndarray) -> list[Photo]:
         part = image[top:bottom, left:right]
         if part.ndim == 2:
             part = cv2.cvtColor(part, cv2.COLOR_GRAY2RGB)
-        scale = min(LONGEST / max(part.shape[:2]), 1.0)
+        scale = min(longest / max(part.shape[:2]), 1.0)
         small = cv2.resize(part, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else part.copy()
         photos.append(Photo(small, np.array([left, top], float), scale))
     return photos

@@ -11,7 +11,7 @@ import numpy as np
 from connrsfm_graph.reconstruction import Reconstruction
 from connrsfm_graph.report.colour import DEPTH, ERROR, point_colours, ramp_colours
 from connrsfm_graph.report.photos import Photo
-from connrsfm_graph.report.raster import View, render, turned
+from connrsfm_graph.report.raster import Raster, View, turned
 from connrsfm_graph.report.surfaces import Surfaces
 
 SIZE = (342, 288)
@@ -49,7 +49,7 @@ class Painter:
     def __init__(self, reconstruction: Reconstruction, surfaces: Surfaces, photos: Sequence[Photo] | None = None):
         """Photos, where given, lie under the tracks."""
         self.reconstruction, self.surfaces, self.photos = reconstruction, surfaces, photos
-        self.identity = point_colours(_typical_place(reconstruction))
+        self.identity = point_colours(typical_place(reconstruction))
         reach = np.max([surfaces.reach(R) for R in VIEWS.values()], axis=0)
         scale = 0.47 * float((np.array(SIZE) / np.maximum(reach, np.finfo(float).tiny)).min())
         self.views = {name: View(R, scale, SIZE) for name, R in VIEWS.items()}
@@ -75,7 +75,7 @@ class Painter:
         """A surface (one of (F, P, 3)) with colours (P, 3), from a named view."""
         part = self.surfaces.triangles[frame]
         part = part[np.isfinite(points[frame][part]).all(axis=(1, 2))]
-        return render(self.views[view], self.surfaces.centre[frame], points[frame], colours, part)
+        return Raster.of(self.views[view], self.surfaces.centre[frame], points[frame], part).coloured(colours)
 
     def tracks(self, frame: int) -> np.ndarray:
         """The image's tracks, one colour per point in all images; wrong ones crossed out in red."""
@@ -124,7 +124,7 @@ def _cross(canvas: np.ndarray, place: tuple[int, ...], colour: tuple[float, floa
         cv2.line(canvas, start, end, rgba, 2, cv2.LINE_AA, 4)
 
 
-def _typical_place(reconstruction: Reconstruction) -> np.ndarray:
+def typical_place(reconstruction: Reconstruction) -> np.ndarray:
     """(P, 2) where each point is in the image that sees most points, or elsewhere in the mean of its images."""
     pixels = np.where(reconstruction.visible[..., None], reconstruction.pixels, np.nan)
     best = pixels[reconstruction.visible.sum(axis=1).argmax()].copy()

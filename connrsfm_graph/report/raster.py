@@ -1,4 +1,4 @@
-"""A software rasteriser: triangles with colours at their corners to an antialiased picture.
+"""A software rasteriser: triangles, coloured at their corners or by a photo, to an antialiased picture.
 
 Orthographic, with smooth Lambert shading and thin mesh lines. Triangles are painted from far to near with their own
 number; what every pixel then shows is worked out from the number it was left with.
@@ -15,6 +15,8 @@ SUPERSAMPLING = 2
 LIGHT = np.array([-0.28, -0.50, -0.82]) / np.linalg.norm([-0.28, -0.50, -0.82])
 """Unit direction to the light, from over the viewer's left shoulder."""
 AMBIENT = 0.45
+PHOTO_AMBIENT = 0.75
+"""A photo has light of its own."""
 MESH_LINE = 0.88
 """Brightness of mesh lines relative to the surface."""
 _SUBPIXEL_BITS = 6
@@ -45,36 +47,82 @@ def turned(right: float, up: float) -> np.ndarray:
     return over @ around
 
 
-def render(
-    view: View, centre: np.ndarray, points: np.ndarray, colours: np.ndarray, triangles: np.ndarray
-) -> np.ndarray:
-    """Picture (height, width, 4), uint8 red, green, blue, alpha, transparent where there is no surface.
+@dataclass(frozen=True)
+class Raster:
+    """What each of N pixels shows of a surface, without its colour; pixels are those of the supersampled picture."""
 
-    Args:
-        view, centre: where to look from and at what.
-        points: (P, 3); corners of triangles are finite.
-        colours: (P, 3) red, green, blue in 0 to 1.
-        triangles: (T, 3) indices of points.
-    """
-    s = SUPERSAMPLING
-    width, height = view.size[0] * s, view.size[1] * s
-    corners = view.project(points, centre)[triangles] * s
-    owner = _painted(corners, width, height)
-    y, x = np.nonzero(owner >= 0)
-    row = owner[y, x]
-    bary, to_side = _inside(corners[..., :2], row, x, y)
-    colour = np.einsum("nk,nkc->nc", bary, colours[triangles][row])
-    n = np.einsum("nk,nkc->nc", bary, _normals(corners, triangles, len(points))[triangles][row])
-    # Both sides of a surface are lit, so a side turned away is told by its shape rather than lost in the dark.
-    n *= np.where(n[:, 2:] > 0, -1.0, 1.0) / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-12)
-    shade = AMBIENT + (1.0 - AMBIENT) * np.maximum(n @ LIGHT, 0.0)
-    shade[to_side < 0.5 * s] *= MESH_LINE
-    picture = np.zeros((height, width, 4))
-    picture[y, x, :3] = colour * shade[:, None]
-    picture[y, x, 3] = 1.0
-    picture = picture.reshape(view.size[1], s, view.size[0], s, 4).mean(axis=(1, 3))
-    picture[..., :3] /= np.maximum(picture[..., 3:], 1e-12)
-    return np.round(255.0 * np.clip(picture, 0.0, 1.0)).astype(np.uint8)
+    size: tuple[int, int]
+    """Width and height of the picture."""
+    at: tuple[np.ndarray, np.ndarray]
+    """Row and column (N,) of the pixels."""
+    corners: np.ndarray
+    """(N, 3) points of the triangle that is seen."""
+    bary: np.ndarray
+    """(N, 3) barycentric coordinates in it."""
+    light: np.ndarray
+    """(N,) share of the light that falls on it."""
+    on_line: np.ndarray
+    """(N,) bool, on a side of the triangle."""
+
+    @staticmethod
+    def of(view: View, centre: np.ndarray, points: np.ndarray, triangles: np.ndarray) -> Raster:
+        """Look at a surface.
+
+        Args:
+            view, centre: where from and at what.
+            points: (P, 3); corners of triangles are finite.
+            triangles: (T, 3) indices of points.
+        """
+        s = SUPERSAMPLING
+        corners = view.project(points, centre)[triangles] * s
+        owner = _painted(corners, view.size[0] * s, view.size[1] * s)
+        y, x = np.nonzero(owner >= 0)
+        row = owner[y, x]
+        bary, to_side = _inside(corners[..., :2], row, x, y)
+        n = np.einsum("nk,nkc->nc", bary, _normals(corners, triangles, len(points))[triangles][row])
+        # Both sides of a surface are lit, so a side turned away is told by its shape rather than lost in the dark.
+        n *= np.where(n[:, 2:] > 0, -1.0, 1.0) / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-12)
+        return Raster(
+            view.size, (y, x), triangles[row], bary, np.maximum(n @ LIGHT, 0.0).astype(np.float32), to_side < 0.5 * s
+        )
+
+    def coloured(self, colours: np.ndarray, lines: bool = True) -> np.ndarray:
+        """Picture (height, width, 4) uint8 red, green, blue, alpha of a surface with colours (P, 3) in 0 to 1.
+
+        Transparent where there is no surface; `lines` draws the sides of the triangles.
+        """
+        shade = AMBIENT + (1.0 - AMBIENT) * self.light
+        if lines:
+            shade = np.where(self.on_line, MESH_LINE * shade, shade)
+        return self._picture(np.einsum("nk,nkc->nc", self.bary, colours[self.corners]) * shade[:, None])
+
+    def textured(self, places: np.ndarray, photo: np.ndarray) -> np.ndarray:
+        """The same of a surface whose points show pixels (P, 2) of a photo (h, w, 3) uint8."""
+        shade = PHOTO_AMBIENT + (1.0 - PHOTO_AMBIENT) * self.light
+        colour = _sampled(photo, np.einsum("nk,nkc->nc", self.bary, places[self.corners]))
+        return self._picture(colour * shade[:, None])
+
+    def _picture(self, values: np.ndarray) -> np.ndarray:
+        s, (width, height) = SUPERSAMPLING, self.size
+        picture = np.zeros((height * s, width * s, 4), dtype=np.float32)
+        picture[(*self.at, slice(3))] = values
+        picture[(*self.at, 3)] = 1.0
+        small = np.asarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA))  # means of s x s pixels
+        colour, alpha = small[..., :3], small[..., 3:]
+        small = np.concatenate([colour / np.maximum(alpha, 1e-12), alpha], axis=2)
+        return np.round(255.0 * np.clip(small, 0.0, 1.0)).astype(np.uint8)
+
+
+def _sampled(photo: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """(N, 3) in 0 to 1, the photo between its pixels at places (N, 2)."""
+    if not len(place):
+        return np.empty((0, 3))
+    x, y = np.clip(place, 0, np.array(photo.shape[1::-1]) - 1.001).T
+    column, row = x.astype(int), y.astype(int)
+    x, y = (x - column)[:, None].astype(np.float32), (y - row)[:, None].astype(np.float32)
+    above = (1 - x) * photo[row, column] + x * photo[row, column + 1]
+    below = (1 - x) * photo[row + 1, column] + x * photo[row + 1, column + 1]
+    return np.asarray((1 - y) * above + y * below) / 255.0
 
 
 def _painted(corners: np.ndarray, width: int, height: int) -> np.ndarray:
@@ -101,7 +149,8 @@ def _inside(corners: np.ndarray, row: np.ndarray, x: np.ndarray, y: np.ndarray) 
     bary /= bary.sum(axis=1, keepdims=True)
     opposite = np.linalg.norm(np.stack([c - b, c, b], axis=1), axis=2)
     altitude = np.abs(twice_area)[:, None] / np.maximum(opposite, 1e-12)
-    return bary, (bary * altitude[row]).min(axis=1)
+    bary = bary.astype(np.float32)  # many pixels: half the memory to go through
+    return bary, (bary * altitude.astype(np.float32)[row]).min(axis=1)
 
 
 def _normals(corners: np.ndarray, triangles: np.ndarray, n_points: int) -> np.ndarray:

@@ -6,19 +6,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator
 
 from connrsfm_graph.dense.layout import DENSE_FOLDER, INDEX_FILE, DenseFrame, DenseIndex, read_depth
+from connrsfm_graph.export.mesh import mesh_of_depth
 from connrsfm_graph.reconstruction import Reconstruction
-from connrsfm_graph.refine.mesh import triangulate
 from connrsfm_graph.report.colour import DEPTH, ERROR, SCALE, Ramp
 from connrsfm_graph.report.surfaces import Surfaces
 from connrsfm_graph.tracks.images import read_image
-
-_LONGEST = 3.0
-"""Grid steps; longer triangles lie along a border that turns inwards, or across a narrow gap."""
 
 
 @dataclass(frozen=True)
@@ -107,8 +103,7 @@ def shown_mesh(
     """The mesh of an image: its dense surface with about `most` vertices, or the triangles between its points."""
     K = reconstruction.K[f]
     known = np.isfinite(reconstruction.points[f]).all(axis=1)
-    projected = reconstruction.points[f, known] @ K.T
-    pixels = projected[:, :2] / projected[:, 2:]
+    pixels = reconstruction.camera.image(reconstruction.points[f, known]) @ K[:2, :2].T + K[:2, 2]
     values = {"depth": surfaces.relief[f, known], "conformal scale": surfaces.log_scale[f, known]}
     if surfaces.error is not None:
         values["error"] = surfaces.error[f, known]
@@ -116,35 +111,13 @@ def shown_mesh(
         number = np.cumsum(known) - 1
         return ShownMesh(surfaces.points[f, known], pixels, number[surfaces.triangles[f]], values)
     depth = read_depth(dense.folder, dense.frames[f])
-    places, parts = mesh_of_region(np.isfinite(depth), most)
-    x, y = places.T
-    rays = np.column_stack([places, np.ones(len(places))]) @ np.linalg.inv(K).T
+    mesh = mesh_of_depth(depth, K, max(1, round(np.sqrt(np.isfinite(depth).sum() / most))))
     s, R, t = surfaces.to_truth[f]
-    points = s * (rays * depth[y, x, None]) @ R.T + t
+    points = s * mesh.points @ R.T + t
+    places = mesh.uv * depth.shape[::-1] - 0.5
     interpolated = {name: _interpolated(pixels, value, places) for name, value in values.items()}
     interpolated["depth"] = points[:, 2] - surfaces.centre[f, 2]
-    return ShownMesh(points, places.astype(float), parts, interpolated)
-
-
-def mesh_of_region(region: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (V, 2) on an even grid inside a region (H, W) bool and along its border, and triangles (T, 3) of them.
-
-    About `most` pixels. Unlike a grid alone, the triangles reach the border, however coarse they are.
-    """
-    step = max(1, int(np.ceil(np.sqrt(region.sum() / most))))
-    mask = region.astype(np.uint8)
-    borders, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-    border = np.concatenate([part[::step, 0] for part in borders]) if borders else np.empty((0, 2), int)
-    y, x = np.nonzero(cv2.distanceTransform(np.pad(mask, 1), cv2.DIST_L2, 3)[1:-1, 1:-1] > 0.6 * step)
-    on_grid = (x % step == 0) & (y % step == 0)
-    places = np.unique(np.concatenate([np.column_stack([x, y])[on_grid], border]), axis=0)
-    parts = triangulate(places.astype(float))
-    if not len(parts):
-        return places, parts
-    corners = places[parts]
-    middle = np.round(corners.mean(axis=1)).astype(int)
-    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-    return places, parts[region[middle[:, 1], middle[:, 0]] & (longest < _LONGEST * step)]
+    return ShownMesh(points, places, mesh.triangles, interpolated)
 
 
 def _interpolated(pixels: np.ndarray, values: np.ndarray, places: np.ndarray) -> np.ndarray:
