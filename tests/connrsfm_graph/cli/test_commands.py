@@ -89,8 +89,17 @@ def test_report_builds_the_page_again(connrsfm: Run, tracks_file: Path, tmp_path
     assert ended.status == 0
     assert ended.out.strip() == str(out / "report.html")
     assert "3D error" not in (out / "report.html").read_text()
-    assert connrsfm("report", out, "--truth", tracks_file).status == 0
+    assert connrsfm("report", out, "--truth", tracks_file, "--renders", 80, "--view=-20,10").status == 0
     assert "3D error" in (out / "report.html").read_text()
+    assert (out / "renders" / "0000_error.png").exists()
+    for option, value, expected in (
+        ("--view", "1", "two numbers"),
+        ("--renders", 3, "16 to 8192"),
+        ("--rerun", "a.txt", ".rrd"),
+    ):
+        ended = connrsfm("report", out, option, value)
+        assert (ended.status, ended.err.count("\n")) == (2, 1)
+        assert expected in ended.err
 
 
 def test_track_follows_images(connrsfm: Run, tmp_path: Path) -> None:
