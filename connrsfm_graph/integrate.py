@@ -16,6 +16,7 @@ graph's edges is 1 as nearly as a least-squares fit can make it, with mean log d
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Literal
 
 import numpy as np
@@ -297,20 +298,27 @@ def _terms_of_log(first: np.ndarray, second: np.ndarray, camera: Camera) -> np.n
 
 
 def bending_matrix(grid: SplineGrid) -> np.ndarray:
-    """(n^2, n^2) integral of S_uu^2 + 2 S_uv^2 + S_vv^2 over the grid, four Gauss points per cell and axis."""
+    """(n^2, n^2) integral of S_uu^2 + 2 S_uv^2 + S_vv^2 over the grid."""
+    uu, uv, vv = _unit_bending(grid.n)
+    hu, hv = grid.step
+    return hu * hv * (uu / hu**4 + 2.0 * uv / (hu * hv) ** 2 + vv / hv**4)
+
+
+@cache
+def _unit_bending(n: int) -> tuple[np.ndarray, ...]:
+    """(n^2, n^2) integrals of S_uu^2, S_uv^2 and S_vv^2 over a grid of unit cells, four Gauss points each and axis."""
+    grid = SplineGrid(n, np.zeros(2), np.ones(2))
     nodes, weights = np.polynomial.legendre.leggauss(4)
     rows = grid.cell_rows((nodes + 1) / 2)
-    area = np.outer(weights, weights).ravel() / 4 * np.prod(grid.step)
-    cell = sum(
-        factor * np.einsum("q,qi,qj->ij", area, rows[:, order], rows[:, order])
-        for factor, order in ((1.0, UU), (2.0, UV), (1.0, VV))
-    )
-    matrix = np.zeros((grid.n**2, grid.n**2))
-    starts = (np.arange(grid.n - 3)[:, None] * grid.n + np.arange(grid.n - 3)).ravel()
-    for start in starts:
-        index = start + grid.patch()
-        matrix[np.ix_(index, index)] += cell
-    return matrix
+    area = np.outer(weights, weights).ravel() / 4
+    first = (np.arange(n - 3)[:, None] * n + np.arange(n - 3)).reshape(-1, 1, 1)
+    row, column = first + grid.patch()[:, None], first + grid.patch()
+    matrices = []
+    for order in (UU, UV, VV):
+        matrix = np.zeros((n**2, n**2))
+        np.add.at(matrix, (row, column), np.einsum("q,qi,qj->ij", area, rows[:, order], rows[:, order]))
+        matrices.append(matrix)
+    return tuple(matrices)
 
 
 def _integrate_graph(problem: Problem, state: State, known: np.ndarray) -> Integrated:

@@ -128,6 +128,30 @@ def _solve_views(begin, end, factor, first, start, x):
         _substitute(factor[f], first, start, x[f])
 
 
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "arcp", "nsz"})
+def _solve_many(begin, end, factor, first, start, x):
+    """The same for several right-hand sides at once, x (F, n, R)."""
+    n, R = x.shape[1:]
+    for f in range(begin, end):
+        L, y = factor[f], x[f]
+        for r in range(n):
+            row = y[r]
+            for c in range(first[r], r):
+                value, other = L[start[r] + c - first[r]], y[c]
+                for k in range(R):
+                    row[k] -= value * other[k]
+            for k in range(R):
+                row[k] /= L[start[r + 1] - 1]
+        for r in range(n - 1, -1, -1):
+            row = y[r]
+            for k in range(R):
+                row[k] /= L[start[r + 1] - 1]
+            for c in range(first[r], r):
+                value, other = L[start[r] + c - first[r]], y[c]
+                for k in range(R):
+                    other[k] -= value * row[k]
+
+
 @njit(cache=True, inline="always")
 def _spread(border, weight, ends, v, x):
     """x += W v for one view, from lengths to unknowns."""
@@ -204,9 +228,10 @@ class Factorised:
             raise ComputationError("refinement: the normal equations of a view are not positive definite")
 
     def solve_views(self, x: np.ndarray) -> np.ndarray:
-        """H_f^-1 x_f for all views, shape (F, n)."""
+        """H_f^-1 x_f for all views, shape (F, n), or (F, n, R) for several right-hand sides."""
         x = x.copy()
-        over_views(_solve_views, len(x), self.factor, self.envelope.first, self.envelope.start, x)
+        kernel = _solve_views if x.ndim == 2 else _solve_many
+        over_views(kernel, len(x), self.factor, self.envelope.first, self.envelope.start, x)
         return x
 
     def spread(self, v: np.ndarray) -> np.ndarray:
