@@ -6,20 +6,23 @@ import argparse
 import sys
 from pathlib import Path
 
+_SETTINGS = (
+    ("variant", str, "compact (the default), densenet169 or resnet50"),
+    ("steps", int, "batches in all"),
+    ("batch", int, "surfaces per batch"),
+    ("size", int, "pixels per side of the images, a multiple of 32"),
+    ("noise", float, "largest noise on the normals, 0 for none"),
+    ("held_out", int, "surfaces that it is evaluated on"),
+    ("seed", int, "seed of weights and surfaces"),
+)
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, required=True, metavar="CKPT", help="checkpoint to write; goes on from CKPT.state if there"
     )
-    parser.add_argument("--variant", default="compact", help="compact, densenet169 or resnet50 (default: %(default)s)")
-    for name, kind, meaning in (
-        ("steps", int, "batches in all"),
-        ("batch", int, "surfaces per batch"),
-        ("size", int, "pixels per side of the images, a multiple of 32"),
-        ("noise", float, "largest noise on the normals, 0 for none"),
-        ("seed", int, "seed of weights and surfaces"),
-    ):
-        parser.add_argument(f"--{name}", type=kind, help=meaning)
+    for name, kind, meaning in _SETTINGS:
+        parser.add_argument(f"--{name.replace('_', '-')}", type=kind, help=meaning)
     parser.add_argument("--device", default="cpu", help="cpu, or cuda for a GPU (default: %(default)s)")
 
 
@@ -35,7 +38,7 @@ def run(arguments: argparse.Namespace) -> None:
 
     if arguments.device not in ("cpu", "cuda") or (arguments.device == "cuda" and not torch.cuda.is_available()):
         raise InputError(f"--device {arguments.device}: not available, expected cpu, or cuda where there is a GPU")
-    given = {name: getattr(arguments, name) for name in ("variant", "steps", "batch", "size", "noise", "seed")}
+    given = {name: getattr(arguments, name) for name, _, _ in _SETTINGS}
     config = TrainConfig(**{name: value for name, value in given.items() if value is not None})
     progress = Progress()
     with progress.stage("train"):

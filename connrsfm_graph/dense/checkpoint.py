@@ -33,7 +33,7 @@ class Checkpoint:
     size: int
     """Pixels per side of its images."""
     slope_range: float
-    """Largest root mean square slope of log depth over the window among its training surfaces."""
+    """Largest root mean square slope of log depth over the window that it was trained on."""
     card: dict[str, Any]
     """How it was trained (`configuration`, `step`) and its errors on held-out surfaces (`history`)."""
 
@@ -75,6 +75,31 @@ class Checkpoint:
         return Checkpoint(network.eval(), content["variant"], content["size"], content["slope_range"], content["card"])
 
 
+def card_text(checkpoint: Checkpoint) -> str:
+    """The card of a checkpoint as Markdown: the command that makes it again, and its errors while it was trained."""
+    settings, history = checkpoint.card["configuration"], checkpoint.card["history"]
+    named = ("variant", "steps", "batch", "size", "noise", "seed")
+    options = " ".join(f"--{name} {settings[name]}" for name in named)
+    count = sum(parameter.numel() for parameter in checkpoint.network.parameters())
+    last = history[-1]
+    lines = [
+        f"# Depth network `{checkpoint.variant}`, {count:,} parameters",
+        "",
+        f"    connrsfm train-depth --out CKPT {options}",
+        "",
+        f"Mean relative error of depth on {settings['held_out']} simulated surfaces held out, after {last['step']} steps: "
+        f"{100 * last['clean']:.2f} % with clean normals, {100 * last['noisy']:.2f} % with 20 % of noise on the normals.",
+        "",
+        "| step | loss | clean % | noisy % |",
+        "|---|---|---|---|",
+    ]
+    lines += [
+        f"| {row['step']} | {row['loss']:.4f} | {100 * row['clean']:.2f} | {100 * row['noisy']:.2f} |"
+        for row in history
+    ]
+    return "\n".join(lines) + "\n"
+
+
 def read_tensors(path: str | Path) -> dict[str, Any]:
     """The dictionary in a file of `torch.save`.
 
@@ -85,7 +110,7 @@ def read_tensors(path: str | Path) -> dict[str, Any]:
     require_file(path)
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except (RuntimeError, pickle.UnpicklingError, EOFError, KeyError, ValueError) as error:
+    except (RuntimeError, pickle.UnpicklingError, EOFError, KeyError, ValueError, OSError) as error:
         raise InputError(f"{path}: cannot be read as a checkpoint (damaged or of another format)") from error
     if not isinstance(content, dict):
         raise InputError(f"{path}: holds no dictionary, expected a checkpoint of 'train-depth'")

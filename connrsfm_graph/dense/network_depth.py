@@ -1,8 +1,8 @@
 """Dense depth maps by the network: from the normals of an image's points, corrected by their depths.
 
 The network answers for the shape that the normals describe. What its log depth lacks at the sparse points, the free
-constant included, is a smooth function over the image and is put back as a spline with few control points whose bending
-weight is chosen by cross-validation: the dense surface passes the sparse points as closely as they deserve.
+constant included, is a smooth function over the image and is put back as a spline: the dense surface agrees with the
+sparse points.
 """
 
 from __future__ import annotations
@@ -22,10 +22,12 @@ from connrsfm_graph.dense.simulated import OBSERVED
 from connrsfm_graph.dense.sparse import SparsePoints
 from connrsfm_graph.dense.spline_depth import cross_validated_error, log_depth_spline, on_grid
 from connrsfm_graph.dense.window import Window, grid, slopes
-from connrsfm_graph.integrate import choose_bending
 
-CORRECTION_POINTS = 10
+CORRECTION_POINTS = 14
 """Control points per axis of the correction, at most."""
+CORRECTION_BENDING = 1e-4
+"""Bending weight of the correction. What the network lacks is no noise, and cross-validation would follow it closely
+where there are points and anywhere at all where there are none."""
 
 
 class NetworkDepth:
@@ -34,26 +36,25 @@ class NetworkDepth:
     name = "network"
 
     def __init__(self, checkpoint: Checkpoint, images: Sequence[SparsePoints]) -> None:
-        """Predict every image and fit the corrections with one bending weight."""
+        """Predict every image and fit the corrections."""
         self._shapes = [_Shape.of(checkpoint, points) for points in images]
         self._corrections = [
             log_depth_spline(points.pixels, np.log(points.depth) - shape.at(points.pixels), CORRECTION_POINTS)
             for points, shape in zip(images, self._shapes, strict=True)
         ]
-        self.bending = choose_bending(self._corrections)
-        self.expected_error = cross_validated_error(self._corrections, self.bending)
+        self.expected_error = cross_validated_error(self._corrections, CORRECTION_BENDING)
         """Root mean square error of log depth that cross-validation expects at a point that was left out."""
 
     def depth(self, number: int, size: tuple[int, int]) -> np.ndarray:
         """(H, W) depth of every pixel of an image of `size` (W, H); off the sparse points' region it means nothing."""
         correction = self._corrections[number]
         x, y = np.arange(size[0]), np.arange(size[1])
-        added = on_grid(correction.grid, correction.control(self.bending), x, y)
+        added = on_grid(correction.grid, correction.control(CORRECTION_BENDING), x, y)
         return np.exp(self._shapes[number].on_grid(x, y) + added)
 
     def depth_at(self, number: int, pixels: np.ndarray) -> np.ndarray:
         """(N,) depth at places (N, 2) of an image."""
-        added = self._corrections[number].surface(pixels, self.bending)[0]
+        added = self._corrections[number].surface(pixels, CORRECTION_BENDING)[0]
         return np.exp(self._shapes[number].at(pixels) + added)
 
 

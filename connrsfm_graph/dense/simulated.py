@@ -118,8 +118,8 @@ class _Region:
 
     @staticmethod
     def draw(rng: np.random.Generator, count: int) -> _Region:
-        power = np.exp(rng.uniform(np.log(2.0), np.log(16.0), (count, 1)))
-        angle = rng.uniform(0.0, 2 * np.pi, count) * (rng.uniform(size=count) < 0.7)
+        power = np.exp(rng.uniform(np.log(2.0), np.log(200.0), (count, 1)))
+        angle = rng.uniform(0.0, 2 * np.pi, count) * (rng.uniform(size=count) < 0.5)
         turn = np.stack([np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)], axis=-1).reshape(-1, 2, 2)
         sides = np.stack([np.ones(count), rng.uniform(0.4, 1.0, count)], axis=-1)
         around = np.linspace(0.0, 2 * np.pi, 72, endpoint=False)

@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from connrsfm_graph.dense.checkpoint import Checkpoint, read_tensors
+from connrsfm_graph.dense.checkpoint import Checkpoint, card_text, read_tensors
 from connrsfm_graph.dense.network import DepthNetwork, make_network, predict, tensor
-from connrsfm_graph.dense.simulated import Batch, simulate
-from connrsfm_graph.dense.window import Conditioned, slopes
+from connrsfm_graph.dense.simulated import HALF_SIZE, SLOPE, Batch, simulate
+from connrsfm_graph.dense.window import Conditioned
 from connrsfm_graph.errors import ComputationError, InputError
 from connrsfm_graph.files import written_beside
 
@@ -69,7 +69,9 @@ def train(
     progress: Callable[[int, int], None] | None = None,
     report: Callable[[str], None] | None = None,
 ) -> Checkpoint:
-    """Train a network and write its checkpoint to `out`, with a state file OUT.state beside it until it is done.
+    """Train a network; write its checkpoint to `out`, and a card in Markdown beside it.
+
+    Until it is done there is a state file OUT.state, from which a training that was interrupted goes on.
 
     Args:
         config: settings; where OUT.state exists, those it was made with, but for the steps.
@@ -94,7 +96,6 @@ def train(
         network.load_state_dict(state["weights"])
         optimiser.load_state_dict(state["optimiser"])
         step, history = state["step"], state["history"]
-    slope_range = _slope_range(config)
     while step < config.steps:
         for group in optimiser.param_groups:
             group["lr"] = config.rate * _schedule(step, config)
@@ -120,10 +121,13 @@ def train(
                 }
                 torch.save(content, part)
             card = {"configuration": asdict(config), "step": step, "history": history}
-            checkpoint = Checkpoint(network, config.variant, config.size, slope_range, card)
+            checkpoint = Checkpoint(network, config.variant, config.size, SLOPE[1] * HALF_SIZE[1], card)
             checkpoint.save(out)
     state_file.unlink(missing_ok=True)
-    return Checkpoint.load(out)
+    checkpoint = Checkpoint.load(out)
+    with written_beside(out.with_suffix(".md")) as part:
+        part.write_text(card_text(checkpoint), encoding="utf-8")
+    return checkpoint
 
 
 def relative_error(log_depth: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
@@ -166,10 +170,3 @@ def _schedule(step: int, config: TrainConfig) -> float:
     """Factor on the step size: a rise over at most 100 steps, a plateau, and a fall to 0."""
     rise = min(1.0, (step + 1) / min(100, config.steps))
     return rise * min(1.0, (config.steps - step) / (config.decay * config.steps))
-
-
-def _slope_range(config: TrainConfig) -> float:
-    """Largest root mean square slope by window coordinates of a thousand surfaces."""
-    batch = simulate(1000, 8, (_TRAINING, config.seed, config.steps), (0.0, 0.0))
-    squares = (slopes(batch.m) ** 2).sum(axis=-1) * batch.observed
-    return float(np.sqrt(squares.sum(axis=1) / batch.observed.sum(axis=1)).max())
