@@ -15,7 +15,7 @@ SUPERSAMPLING = 2
 LIGHT = np.array([-0.28, -0.50, -0.82]) / np.linalg.norm([-0.28, -0.50, -0.82])
 """Unit direction to the light, from over the viewer's left shoulder."""
 AMBIENT = 0.45
-PHOTO_AMBIENT = 0.75
+PHOTO_AMBIENT = 0.8
 """A photo has light of its own."""
 MESH_LINE = 0.88
 """Brightness of mesh lines relative to the surface."""

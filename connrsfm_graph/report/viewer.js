@@ -161,7 +161,7 @@
     if (photo && photo.src !== frame.photo) photo.src = frame.photo;
     const source = kind < 0 ? pixels(frame) : null;
     if (kind < 0 && !source) return; // drawn when the photo is there
-    const p = project(mesh.points, width, height), lit = brightness(p, mesh.triangles, kind < 0 ? 0.75 : 0.45);
+    const p = project(mesh.points, width, height), lit = brightness(p, mesh.triangles, kind < 0 ? 0.8 : 0.45);
     const image = pen.createImageData(width, height);
     fill(image, p, mesh.triangles, lit, kind < 0 ? byPhoto(mesh.texture, source) : byValue(mesh.values[kind], ramps[kind]));
     pen.putImageData(image, 0, 0);

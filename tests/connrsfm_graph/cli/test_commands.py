@@ -146,6 +146,8 @@ def test_demo_makes_everything_itself(connrsfm: Run, tmp_path: Path, monkeypatch
     assert tracks.image_names == ("000.png", "001.png", "002.png", "003.png")
     assert len(list((tmp_path / "demo" / "images").iterdir())) == 4
     assert "0000_tracks.png" in {path.name for path in (tmp_path / "demo" / "pictures").iterdir()}
+    assert len(list((tmp_path / "demo" / "dense" / "glb").iterdir())) == 4
+    assert "Dense surfaces" in (tmp_path / "demo" / "report.html").read_text()
 
 
 def test_interrupted_run_leaves_nothing(connrsfm: Run, tracks_file: Path, tmp_path: Path) -> None:
