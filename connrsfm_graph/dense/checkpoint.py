@@ -87,8 +87,8 @@ def card_text(checkpoint: Checkpoint) -> str:
         "",
         f"    connrsfm train-depth --out CKPT {options}",
         "",
-        f"Mean relative error of depth on {settings['held_out']} simulated surfaces held out, after {last['step']} steps: "
-        f"{100 * last['clean']:.2f} % with clean normals, {100 * last['noisy']:.2f} % with 20 % of noise on the normals.",
+        f"Mean relative error of depth on {settings['held_out']} simulated surfaces held out: {100 * last['clean']:.2f} % "
+        f"with clean normals, {100 * last['noisy']:.2f} % with noise of 20 % on the normals.",
         "",
         "| step | loss | clean % | noisy % |",
         "|---|---|---|---|",
