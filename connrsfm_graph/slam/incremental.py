@@ -20,11 +20,13 @@ import numpy as np
 from connrsfm_graph.errors import InputError
 from connrsfm_graph.metrics.alignment import align_similarity
 from connrsfm_graph.slam.assemble import MapModel, link_scales, pose_key
+from connrsfm_graph.slam.elimination import MapState, MapTerms
 from connrsfm_graph.slam.fuse import GAUGE_SIGMA, Fused, FusionConfig, fuse
 from connrsfm_graph.slam.growing_map import GrowingMap
+from connrsfm_graph.slam.minimise import camera_arrays
 from connrsfm_graph.slam.noise import FusionNoise
 from connrsfm_graph.slam.relaxation import relaxed
-from connrsfm_graph.slam.sightings import View
+from connrsfm_graph.slam.sightings import Sightings, View
 from connrsfm_graph.slam.window import Window, camera_keys, is_camera
 from connrsfm_graph.solvers.interface import Levenberg
 from factors.keys import LOG_DEPTH, MAP_POINT, VIEW_SCALE, decode, describe, key
@@ -170,15 +172,29 @@ class IncrementalFusion:
         pose = self.pose(view)
         return pose[:3, 3] + np.exp(self.log_scale(view)) * self.map.shape[view] @ pose[:3, :3].T
 
+    def cost(self) -> float:
+        """Cost of the whole estimate: what `finish` starts from, comparable with `Fused.cost`."""
+        sightings, log_depth, points = self._estimate()
+        terms = MapTerms(sightings, self.noise, self.config.map)
+        cameras = camera_arrays(self.values, range(self.n_views))
+        state = MapState(*cameras, log_depth[terms.view, terms.point], points[terms.view, terms.point])
+        links = [link_scales(n, n + 1, self.noise) for n in range(self.n_views - 1)]
+        return terms.cost(state) + self.graph.error(self.values) + sum(link.error(self.values) for link in links)
+
     def finish(self, config: FusionConfig | None = None) -> Fused:
         """The batch fusion of everything so far, from the current estimate."""
         config = config or FusionConfig(map=self.config.map)
+        sightings, log_depth, points = self._estimate()
+        return fuse(sightings, self.noise, self.graph, self.values, config, estimate=(log_depth, points))
+
+    def _estimate(self) -> tuple[Sightings, np.ndarray, np.ndarray]:
+        """What all views saw, estimated log depths (F, P) and map points (F, P, 3); 0 where not seen."""
         sightings = self.map.sightings()
         log_depth, points = np.zeros(sightings.seen.shape), np.zeros((*sightings.seen.shape, 3))
         for number, view in enumerate(self.map.views):
             log_depth[number, view.points] = self.map.log_depth[number]
             points[number, view.points] = self.map_points(number)
-        return fuse(sightings, self.noise, self.graph, self.values, config, estimate=(log_depth, points))
+        return sightings, log_depth, points
 
     def _predicted(self, view: View, step: np.ndarray | None) -> tuple[gtsam.Pose3, float]:
         """Pose and log scale to start a view from: by odometry, or by the map as it was last seen."""
