@@ -80,23 +80,20 @@ def card_text(checkpoint: Checkpoint) -> str:
     settings, history = checkpoint.card["configuration"], checkpoint.card["history"]
     named = ("variant", "steps", "batch", "size", "noise", "seed")
     options = " ".join(f"--{name} {settings[name]}" for name in named)
-    count = sum(parameter.numel() for parameter in checkpoint.network.parameters())
-    last = history[-1]
+    parameters = sum(parameter.numel() for parameter in checkpoint.network.parameters())
     lines = [
-        f"# Depth network `{checkpoint.variant}`, {count:,} parameters",
+        f"# Depth network `{checkpoint.variant}`, {parameters:,} parameters",
         "",
         f"    connrsfm train-depth --out CKPT {options}",
         "",
-        f"Mean relative error of depth on {settings['held_out']} simulated surfaces held out: {100 * last['clean']:.2f} % "
-        f"with clean normals, {100 * last['noisy']:.2f} % with noise of 20 % on the normals.",
+        f"Mean relative error of depth on {settings['held_out']} simulated surfaces held out, in percent, with clean",
+        "normals and with noise of 20 % on the normals, while it was trained:",
         "",
-        "| step | loss | clean % | noisy % |",
+        "| step | loss | clean | noisy |",
         "|---|---|---|---|",
     ]
-    lines += [
-        f"| {row['step']} | {row['loss']:.4f} | {100 * row['clean']:.2f} | {100 * row['noisy']:.2f} |"
-        for row in history
-    ]
+    for row in history:
+        lines.append(f"| {row['step']} | {row['loss']:.4f} | {100 * row['clean']:.2f} | {100 * row['noisy']:.2f} |")
     return "\n".join(lines) + "\n"
 
 
