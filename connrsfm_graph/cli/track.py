@@ -60,6 +60,9 @@ def run(arguments: argparse.Namespace) -> None:
             if path.suffix.lower() != ending:
                 raise InputError(f"{option} {path}: expected a name that ends in {ending}")
             check_output_folder(path.parent)
+    if arguments.save_images is not None:
+        if check_output_folder(arguments.save_images).resolve() == arguments.images.resolve():
+            raise InputError(f"--save-images {arguments.save_images}: is the folder of the images, expected another")
     config = override(TrackingConfig(), arguments.set)
     K = parse_intrinsics(arguments.intrinsics)
     distortion = None if arguments.distortion is None else parse_distortion(arguments.distortion)

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from connrsfm_graph.errors import InputError
+from connrsfm_graph.tracks.check import MIN_FRAMES
 from connrsfm_graph.tracks.follow import TrackingConfig, track_images
 from connrsfm_graph.tracks.images import Source
 from connrsfm_graph.tracks.keyframes import keyframes
@@ -48,6 +50,8 @@ def images_to_tracks(
     Raises:
         InputError: what `track_images`, `undistort_pixels` and `keyframes` raise.
     """
+    if n_keyframes is not None and n_keyframes < MIN_FRAMES:
+        raise InputError(f"{n_keyframes} keyframes asked for, expected at least {MIN_FRAMES}")
     tracks = track_images(source, intrinsics, config, masks, progress)
     if distortion is not None:
         pixels = undistort_pixels(tracks.pixels, intrinsics, distortion)

@@ -165,6 +165,10 @@ def test_track_refuses(connrsfm: Run, tmp_path: Path) -> None:
         connrsfm("track", empty, "--intrinsics", "9,9,0,0", "--out", out, "--picture", "a.jpg"),
         "name that ends in .png",
     )
+    refused(
+        connrsfm("track", empty, "--intrinsics", "9,9,0,0", "--out", out, "--save-images", empty), "expected another"
+    )
+    refused(connrsfm("track", empty, "--intrinsics", "9,9,0,0", "--out", out, "--keyframes", 2), "expected at least 3")
     image = np.random.default_rng(0).integers(0, 255, (60, 80), dtype=np.uint8)
     cv2.imwrite(str(empty / "0.png"), image)
     refused(connrsfm("track", empty, "--intrinsics", "9,9,0,0", "--out", out), "shows 1 image, expected at least 3")
