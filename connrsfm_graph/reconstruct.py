@@ -9,25 +9,30 @@ the other images follow these in blocks.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from connrsfm_graph.config import as_dict
-from connrsfm_graph.errors import ComputationError
+from connrsfm_graph.errors import ComputationError, InputError
 from connrsfm_graph.image_graph import GraphConfig, ImageGraph, select_edges
 from connrsfm_graph.initialise import Start, initialise
 from connrsfm_graph.integrate import IntegrationConfig
 from connrsfm_graph.keyframes import KeyframeConfig, choose_keyframes
 from connrsfm_graph.orthographic import in_own_unit, in_unit_of, refine_from_afar
-from connrsfm_graph.others import Guide, Others, reconstruct_others
+from connrsfm_graph.others import Guide
 from connrsfm_graph.problem import Problem, make_problem
 from connrsfm_graph.progress import Progress
 from connrsfm_graph.reconstruction import Reconstruction, RunRecord, package_versions, peak_memory_mib
+from connrsfm_graph.record import Account, account_of, problem_warnings
 from connrsfm_graph.refine import RefineConfig, Refined, refine
+from connrsfm_graph.running.checkpoints import Checkpoints
+from connrsfm_graph.running.config import RunningConfig
+from connrsfm_graph.running.crew import Here, Plan, assembled
+from connrsfm_graph.running.follow import follow_keyframes
+from connrsfm_graph.running.gather import Gathering
 from connrsfm_graph.solvers.batched import BatchedBackend
 from connrsfm_graph.solvers.gtsam_backend import GtsamBackend
 from connrsfm_graph.solvers.interface import Backend
@@ -35,12 +40,6 @@ from connrsfm_graph.solvers.separable import SolveConfig, Solved, solve
 from connrsfm_graph.surfaces import Surfaces, scales, surfaces_of_points, surfaces_of_terms
 from connrsfm_graph.tracks import Tracks
 from connrsfm_graph.warps import WarpConfig, Warps, estimate_pixel_noise, fit_warps
-from connrsfm_graph.warps.cycles import cycle_agreement
-
-NOISY = 0.05
-"""Misfit of the warps, relative to the points' spread, from which the user is warned."""
-BLOCK = 32
-"""Images that follow the keyframes at a time."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +65,12 @@ class Config:
     """Whether to refine."""
     seed: int = 0
     """Seed of every random choice."""
+    running: RunningConfig = field(default_factory=RunningConfig)
+    """How the run is carried out; no result depends on it."""
+
+    def __post_init__(self) -> None:
+        if self.seed < 0:
+            raise InputError(f"seed is {self.seed}, expected 0 or more")
 
 
 def default_config(mode: Literal["default", "paper"] = "default") -> Config:
@@ -91,9 +96,26 @@ class Joint:
     """Bending weight of the splines that give the surfaces' terms."""
 
 
+@dataclass(frozen=True)
+class Keyframes:
+    """What is kept of images reconstructed jointly."""
+
+    graph: ImageGraph
+    surfaces: Surfaces
+    conformal_scale: np.ndarray
+    """(E, P) on the edges of the graph, NaN where a pair was not observed."""
+    guide: Guide | None
+    """What other images need of them; None where there are no others."""
+    account: Account
+    """What is to be said about them."""
+
+
 @threadpool_limits.wrap(limits=1, user_api="blas")
 def reconstruct(
-    tracks: Tracks, config: Config | None = None, progress: Progress | None = None
+    tracks: Tracks,
+    config: Config | None = None,
+    progress: Progress | None = None,
+    checkpoints: Checkpoints | None = None,
 ) -> tuple[Reconstruction, RunRecord]:
     """Reconstruct the surface of every image.
 
@@ -103,51 +125,91 @@ def reconstruct(
         tracks: checked tracks (see `tracks.check_reconstructable` for what makes them reconstructable).
         config: settings; the defaults where None.
         progress: times and shows the stages.
+        checkpoints: where finished stages and blocks are kept, and a result that is large for the memory lies on disk
+            (its arrays are then mapped to files there); None keeps all in memory.
 
     Raises:
         InputError: the tracks cannot be used (for example, groups of images share no tracks).
         ComputationError: a stage failed.
     """
-    config = config or Config()
-    progress = progress or Progress()
+    config, progress, checkpoints = config or Config(), progress or Progress(), checkpoints or Checkpoints()
     if tracks.camera.kappa:
-        return _reconstruct(tracks, config, progress)
+        return _reconstruct(tracks, config, progress, checkpoints)
     scaled, unit = in_own_unit(tracks)
-    result, record = _reconstruct(scaled, orthographic_settings(config), progress)
+    result, record = _reconstruct(scaled, orthographic_settings(config), progress, checkpoints)
     return in_unit_of(tracks, result, unit), record
 
 
-def _reconstruct(tracks: Tracks, config: Config, progress: Progress) -> tuple[Reconstruction, RunRecord]:
+def _reconstruct(
+    tracks: Tracks, config: Config, progress: Progress, checkpoints: Checkpoints
+) -> tuple[Reconstruction, RunRecord]:
     keys = np.arange(tracks.n_frames)
     if config.refinement:
         keys = choose_keyframes(tracks.visible, config.keyframes, config.graph.min_shared)
-    joint = reconstruct_jointly(tracks.select(frames=keys), config, progress)
-    others: list[tuple[np.ndarray, Others]] = []
-    rest = np.setdiff1d(np.arange(tracks.n_frames), keys)
-    if len(rest):
-        guide = make_guide(tracks.select(frames=keys), joint, config)
-        with progress.stage("other images"):
-            for first in range(0, len(rest), BLOCK):
-                part = tracks.select(frames=rest[first : first + BLOCK])
-                others.append((rest[first : first + BLOCK], reconstruct_others(guide, part.normalised(), part.visible)))
-                progress.update(min(first + BLOCK, len(rest)), len(rest))
-    return _gathered(tracks, keys, joint, others), _record(tracks, config, keys, joint, others, progress)
+    n_following = tracks.n_frames - len(keys)
+    plan = Plan.of(config.running, tracks.n_frames, n_following, tracks.n_points)
+    with assembled(config.running, plan) if n_following else Here() as crew:
+        joint = checkpoints.kept(
+            "keyframes", Keyframes, lambda: _keyframes(tracks, keys, config, progress, checkpoints)
+        )
+        folder = checkpoints.folder / "arrays" if plan.on_disk and checkpoints.folder is not None else None
+        gathering = Gathering(tracks, keys, joint.graph, joint.surfaces, joint.conformal_scale, folder)
+        peaks: dict[str, float] = {}
+        if joint.guide is not None:
+            with progress.stage("other images"):
+                peaks = follow_keyframes(tracks, joint.guide, gathering, crew, plan, checkpoints, progress)
+    account = joint.account
+    decisions = account.decisions | {"keyframes": {"jointly": len(keys), "following": n_following}}
+    if n_following:
+        decisions["running"] = {"processes at work": len(peaks), "images in a block": plan.block}
+    record = RunRecord(
+        source="",
+        method="connrsfm",
+        seed=config.seed,
+        configuration=as_dict(config),
+        decisions=decisions,
+        warnings=(*problem_warnings((*account.problems, *gathering.problems())), *account.warnings),
+        cost_history=account.cost_history,
+        seconds=dict(progress.seconds),
+        peak_memory_mib=peak_memory_mib() + sum(peaks.values()),
+        versions=package_versions(),
+    )
+    return gathering.result(), record
 
 
-def reconstruct_jointly(tracks: Tracks, config: Config, progress: Progress) -> Joint:
+def _keyframes(
+    tracks: Tracks, keys: np.ndarray, config: Config, progress: Progress, checkpoints: Checkpoints
+) -> Keyframes:
+    part = tracks.select(frames=keys)
+    joint = reconstruct_jointly(part, config, progress, checkpoints)
+    guide = make_guide(part, joint, config) if len(keys) < tracks.n_frames else None
+    account = account_of(part, keys, joint.graph, joint.warps, joint.solved, joint.refined)
+    return Keyframes(joint.graph, joint.surfaces, joint.conformal_scale, guide, account)
+
+
+def reconstruct_jointly(
+    tracks: Tracks, config: Config, progress: Progress, checkpoints: Checkpoints | None = None
+) -> Joint:
     """All stages, of all images together; arguments and errors as for `reconstruct`."""
+    checkpoints = checkpoints or Checkpoints()
     image, visible = tracks.normalised(), tracks.visible
     with progress.stage("image graph"):
         graph = select_edges(visible, config.graph, image)
     with progress.stage("warps"):
-        warps = fit_warps(image, visible, graph.edges, config.warps, progress.update)
+        warps = checkpoints.kept(
+            "warps", Warps, lambda: fit_warps(image, visible, graph.edges, config.warps, progress.update)
+        )
     problem = make_problem(image, visible, graph.edges, warps.jets, warps.weight * warps.valid, tracks.camera)
     _refuse_unrelated(problem, warps)
     backend = make_backend(config.solve.backend)
-    with progress.stage("pre-step"):
-        start = initialise(problem, backend, config.solve.levenberg, config.start, config.seed)
-    with progress.stage("solve"):
-        solved = solve(problem, start, backend, config.solve, config.integrate, progress.update)
+
+    def differentially() -> Solved:
+        with progress.stage("pre-step"):
+            start = initialise(problem, backend, config.solve.levenberg, config.start, config.seed)
+        with progress.stage("solve"):
+            return solve(problem, start, backend, config.solve, config.integrate, progress.update)
+
+    solved = checkpoints.kept("solve", Solved, differentially)
     refined = None
     if config.refinement:
         with progress.stage("noise level"):
@@ -207,109 +269,3 @@ def _refuse_unrelated(problem: Problem, warps: Warps) -> None:
             f"image {frame} cannot be related to any other: {reasons[0] if reasons else 'no warp is usable'}; "
             "check its tracks for gross errors, or leave it out"
         )
-
-
-def _gathered(
-    tracks: Tracks, keys: np.ndarray, joint: Joint, others: Sequence[tuple[np.ndarray, Others]]
-) -> Reconstruction:
-    """Keyframes and other images in the order of the sequence."""
-    parts = [(keys, joint.surfaces), *((frames, other.surfaces) for frames, other in others)]
-    order = np.argsort(np.concatenate([frames for frames, _ in parts]))
-
-    def gathered(name: str) -> np.ndarray:
-        return np.concatenate([getattr(surfaces, name) for _, surfaces in parts])[order]
-
-    edges = [keys[joint.graph.edges]]
-    edges += [np.sort(np.stack([keys[other.keyframe], frames], axis=1), axis=1) for frames, other in others]
-    scale = [joint.conformal_scale]
-    for frames, other in others:  # edges run from the lower image to the higher
-        backwards = (frames < keys[other.keyframe])[:, None]
-        scale.append(np.where(backwards, 1.0 / other.conformal_scale, other.conformal_scale))
-    ambiguous = gathered("ambiguous")
-    return Reconstruction(
-        pixels=tracks.pixels,
-        K=tracks.K,
-        visible=tracks.visible,
-        points=gathered("points"),
-        normals=gathered("normals"),
-        depth=gathered("depth"),
-        first_order=gathered("first_order"),
-        second_order=gathered("second_order"),
-        edges=np.concatenate(edges),
-        edge_weight=np.concatenate([joint.graph.weight, *(other.edge_weight for _, other in others)]),
-        conformal_scale=np.concatenate(scale),
-        depth_std=gathered("depth_std"),
-        log_factor=gathered("log_factor"),
-        interpolated=gathered("interpolated"),
-        outlier=gathered("outlier"),
-        image_names=None if tracks.image_names is None else np.asarray(tracks.image_names),
-        ambiguous=None if joint.surfaces.alternative is None else ambiguous,
-        alternative=None if joint.surfaces.alternative is None else gathered("alternative"),
-        camera=tracks.camera,
-    )
-
-
-def _record(
-    tracks: Tracks,
-    config: Config,
-    keys: np.ndarray,
-    joint: Joint,
-    others: Sequence[tuple[np.ndarray, Others]],
-    progress: Progress,
-) -> RunRecord:
-    graph, warps, solved, refined = joint.graph, joint.warps, joint.solved, joint.refined
-    reports = zip(keys[warps.edges], warps.reports, strict=True)
-    problems = [((a, b), report.problem) for (a, b), report in reports if report.problem]
-    for frames, other in others:
-        ends = zip(keys[other.keyframe], frames, other.problem, strict=True)
-        problems += [((a, b), problem) for a, b, problem in ends if problem]
-    warnings = [f"warp from image {a} to image {b}: {problem}" for (a, b), problem in problems[:5]]
-    if len(problems) > 5:
-        warnings.append(f"{len(problems) - 5} more warps had problems")
-    cycles = cycle_agreement(warps)
-    suspects = cycles.suspects()
-    if len(suspects):
-        pairs = ", ".join(f"{a}-{b}" for a, b in keys[warps.edges[suspects[:5]]])
-        warnings.append(f"{len(suspects)} warps disagree with the others around cycles of the image graph ({pairs})")
-    spread = float(np.nanmedian(np.nanstd(tracks.pixels, axis=1)))
-    if (misfit := (_median(warps.residual) or 0.0) * tracks.focal_length()) > NOISY * spread:
-        warnings.append(
-            f"the tracks are very noisy or no smooth surface: warps miss by {misfit:.3g} pixels, "
-            f"{misfit / spread:.0%} of the points' spread"
-        )
-    decisions: dict[str, Any] = {
-        "warp model": sorted({report.model for report in warps.reports}),
-        "keyframes": {"jointly": len(keys), "following": tracks.n_frames - len(keys)},
-        "edges": {"tree": graph.n_tree, "extra": len(graph.edges) - graph.n_tree},
-        "disagreement of warps around triangles (median)": _median(cycles.disagreement),
-        "warp residual in pixels (median)": (_median(warps.residual) or 0.0) * tracks.focal_length(),
-        "integration bending weight": solved.integrated.bending,
-        "convergence index": solved.index_history,
-        "scale convention": "each image is scaled so that the median conformal scale of the edges is 1",
-    }
-    costs = {"differential solve": solved.cost_history}
-    if refined is not None:
-        decisions |= {"model": refined.model, "refinement": refined.evidence}
-        decisions["scale convention"] = "each image is scaled so that edge lengths agree with those of all images"
-        costs["refinement"] = list(refined.cost_history)
-        warnings += refined.warnings
-    if not tracks.camera.kappa:
-        decisions["scale convention"] = "each image is in the unit of length of its intrinsics"
-        decisions["mirror images"] = "second fundamental forms agree, most of the surface bulges towards the camera"
-    return RunRecord(
-        source="",
-        method="connrsfm",
-        seed=config.seed,
-        configuration=as_dict(config),
-        decisions=decisions,
-        warnings=tuple(warnings),
-        cost_history=costs,
-        seconds=dict(progress.seconds),
-        peak_memory_mib=peak_memory_mib(),
-        versions=package_versions(),
-    )
-
-
-def _median(values: np.ndarray) -> float | None:
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if len(known) else None

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from connrsfm_graph.errors import InputError
-from connrsfm_graph.files import read_npz, require_file, written_beside
+from connrsfm_graph.files import read_npz, require_file, write_npz, written_beside
 from factors.surface import CAMERAS, PERSPECTIVE, Camera
 
 RESULT_FILE = "result.npz"
@@ -91,12 +91,14 @@ class Reconstruction:
         """Write `result.npz`; the same reconstruction gives the same bytes."""
         arrays = {item.name: getattr(self, item.name) for item in fields(self)}
         arrays["camera"] = None if self.camera is PERSPECTIVE else np.array(self.camera.name)
-        with written_beside(path) as part, part.open("wb") as stream:
-            np.savez_compressed(stream, allow_pickle=False, **{k: v for k, v in arrays.items() if v is not None})
+        with written_beside(path) as part:
+            write_npz(part, {name: array for name, array in arrays.items() if array is not None})
 
     @staticmethod
     def load(path: str | Path) -> Reconstruction:
         """Read `result.npz`, or the folder that holds it; fields this version does not know are ignored.
+
+        Large arrays are mapped from the file, not read (see `files.write_npz`); changes to them stay in memory.
 
         Raises:
             InputError: the file cannot be read, or a field is absent or has a wrong shape or type.
@@ -168,7 +170,7 @@ def _checked(
         raise InputError(f"{source}: '{name}' has shape {array.shape}, expected ({wanted})")
     if array.dtype.kind not in _KINDS[kind][0]:
         raise InputError(f"{source}: '{name}' holds {array.dtype} values, expected {_KINDS[kind][1]}")
-    return array.astype(kind)
+    return array.astype(kind, copy=False)
 
 
 @dataclass(frozen=True)
@@ -192,7 +194,7 @@ class RunRecord:
     seconds: dict[str, float] = field(default_factory=dict)
     """Wall-clock seconds of each stage."""
     peak_memory_mib: float = 0.0
-    """Largest resident memory of the process in MiB."""
+    """Largest resident memory of the run's processes, added up, in MiB."""
     versions: dict[str, str] = field(default_factory=dict)
     """Versions of Python and of the packages that compute."""
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
 
     from connrsfm_graph.progress import Progress
     from connrsfm_graph.reconstruct import Config
+    from connrsfm_graph.reconstruction import Reconstruction, RunRecord
     from connrsfm_graph.tracks import Tracks
 
 CONFIG_FILE = "config.toml"
@@ -38,6 +40,30 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_configuration(parser)
     parser.add_argument("--images", type=Path, metavar="IMAGES", help="the images that were tracked, for the page")
     parser.add_argument("--no-report", action="store_true", help="write no page with pictures")
+    add_running(parser)
+    parser.add_argument(
+        "--resume",
+        action="store_true",
+        help="go on with a run that was interrupted, from what it left in DIR.partial; the result is the same",
+    )
+
+
+def add_running(parser: argparse.ArgumentParser) -> None:
+    """Options of how a run is carried out, each short for a setting."""
+    for option, metavar, what in (
+        ("--workers", "N", "processes that share out the images of a long sequence"),
+        ("--cluster", "ADDRESS", "Dask scheduler, such as tcp://host:8786, whose workers do so instead"),
+        ("--memory-limit", "SIZE", "memory that the run may take on this machine, such as 4GiB"),
+    ):
+        key = f"running.{option.strip('-').replace('-', '_')}"
+        parser.add_argument(
+            option,
+            dest="set",
+            action="append",
+            type=f"{key}={{}}".format,
+            metavar=metavar,
+            help=f"{what} (setting {key})",
+        )
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -61,6 +87,7 @@ def run(arguments: argparse.Namespace) -> None:
         method=arguments.method,
         report=not arguments.no_report,
         images=images,
+        resume=arguments.resume,
     )
 
 
@@ -73,10 +100,12 @@ def reconstruct_into(
     method: str = DEFAULT_METHOD,
     report: bool = True,
     images: Iterable[np.ndarray] | None = None,
+    resume: bool = False,
 ) -> None:
     """Reconstruct, write everything into `out` and say what came of it.
 
-    The result is in place before the page is made, so an interrupted page costs no result.
+    The result is in place before the page is made, so an interrupted page costs no result. Until then what is finished
+    is kept in a folder beside it, from which `resume` goes on.
     """
     from connrsfm_graph.config import as_toml
     from connrsfm_graph.errors import InputError
@@ -84,13 +113,22 @@ def reconstruct_into(
     from connrsfm_graph.methods import METHODS
     from connrsfm_graph.reconstruction import RECORD_FILE, RESULT_FILE
     from connrsfm_graph.report.page import remove_report
+    from connrsfm_graph.running.checkpoints import Checkpoints
     from connrsfm_graph.tracks import check_reconstructable
 
     if method not in METHODS:
         raise InputError(f"--method {method}: no such method, expected one of {', '.join(METHODS)}")
     tracks, hints = check_reconstructable(tracks, source)
+    checkpoints = Checkpoints()
+    run: Callable[..., tuple[Reconstruction, RunRecord]] = METHODS[method]
+    if method == DEFAULT_METHOD:
+        checkpoints = Checkpoints.beside(out, tracks, config, resume)
+        run = partial(run, checkpoints=checkpoints)
+    elif resume:
+        raise InputError(f"--resume: only the method {DEFAULT_METHOD} leaves something to go on from")
     try:
-        reconstruction, record = METHODS[method](tracks, config, progress)
+        with checkpoints.told_on_error():
+            reconstruction, record = run(tracks, config, progress)
     except InputError as error:
         raise InputError(f"{source}: {error}") from error
     warnings = tuple(dict.fromkeys((*hints, *record.warnings)))
@@ -99,6 +137,7 @@ def reconstruct_into(
         reconstruction.save(part / RESULT_FILE)
         record.save(part / RECORD_FILE)
         (part / CONFIG_FILE).write_text(as_toml(config), encoding="utf-8")
+    checkpoints.remove()
     remove_report(out)
     for warning in warnings:
         print(f"warning: {warning}", file=sys.stderr)

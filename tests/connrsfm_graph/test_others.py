@@ -7,12 +7,12 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from connrsfm_graph import reconstruct as main
 from connrsfm_graph.keyframes import KeyframeConfig
 from connrsfm_graph.metrics import evaluate
 from connrsfm_graph.others import reconstruct_others
 from connrsfm_graph.progress import Progress
 from connrsfm_graph.reconstruct import Config, make_guide, reconstruct, reconstruct_jointly
+from connrsfm_graph.running.config import RunningConfig
 from connrsfm_graph.synthetic import isometric_bending, moebius, with_missing, with_noise, with_outliers
 
 FEW = Config(keyframes=KeyframeConfig(most=8))
@@ -49,11 +49,10 @@ def test_following_costs_little_accuracy(long_tracks, spoiled):
     assert np.isfinite(following.depth_std[seen]).all()
 
 
-def test_the_result_does_not_depend_on_the_blocks(long_tracks, monkeypatch):
+def test_the_result_does_not_depend_on_the_blocks(long_tracks):
     tracks = with_outliers(with_noise(long_tracks, 1.0), 0.05)[0]
     first, _ = reconstruct(tracks, FEW)
-    monkeypatch.setattr(main, "BLOCK", 5)
-    second, _ = reconstruct(tracks, FEW)
+    second, _ = reconstruct(tracks, replace(FEW, running=RunningConfig(block=5)))
     for item in fields(first):
         np.testing.assert_array_equal(getattr(first, item.name), getattr(second, item.name), err_msg=item.name)
 
