@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from experiments import accuracy, cloth, theorem
+from experiments import accuracy, cloth, dense, theorem
 from experiments.ablations import ABLATION, EDGES, ITERATIONS, STARTING_VALUES
 from experiments.missing import MISSING
 from experiments.real import FLAG, KINECT_PAPER, TSHIRT
@@ -47,6 +47,7 @@ EXPERIMENTS: dict[str, Callable[[Options], None]] = {
     "theorem": verify_theorem,
     **{experiment.name: experiment for experiment in TABLES},
     "cloth": cloth.measure,
+    "dense": dense.measure,
     "accuracy": accuracy.measure,
     "summary": summarise,
 }

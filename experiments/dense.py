@@ -168,10 +168,10 @@ def _left_out(method: Callable[[list[SparsePoints]], DepthMethod], file: Path) -
 def _ablation(options: Options, checkpoint: Checkpoint) -> Runs:
     from connrsfm_graph.dense.train import TrainConfig
 
-    encoders, steps = (ENCODERS[:1], 2) if options.quick else (ENCODERS, ABLATION_STEPS)
+    encoders, steps, held_out = (ENCODERS[:1], 2, 8) if options.quick else (ENCODERS, ABLATION_STEPS, 256)
     for encoder, noise in product(encoders, AUGMENTATION):
         config = TrainConfig(
-            variant=encoder, steps=steps, batch=ABLATION_BATCH, noise=noise, every=steps, held_out=ABLATION_BATCH * 16
+            variant=encoder, steps=steps, batch=ABLATION_BATCH, noise=noise, every=steps, held_out=held_out
         )
         name = f"{encoder}, {'noise' if noise else 'no noise'} in training"
         file = options.out / f"dense_{encoder}_{noise:g}.pt"

@@ -51,7 +51,8 @@ def test_the_command_line_knows_every_experiment(capsys: pytest.CaptureFixture[s
     with pytest.raises(SystemExit) as stop:
         main(["no_such_experiment"])
     assert stop.value.code == 2
-    assert {experiment.name for experiment in TABLES} | {"theorem", "cloth", "accuracy", "summary"} == set(EXPERIMENTS)
+    others = {"theorem", "cloth", "dense", "accuracy", "summary"}
+    assert {experiment.name for experiment in TABLES} | others == set(EXPERIMENTS)
 
 
 def test_a_named_experiment_writes_into_the_folder(tmp_path: Path) -> None:
@@ -64,6 +65,7 @@ def test_a_named_experiment_writes_into_the_folder(tmp_path: Path) -> None:
 def test_the_quick_set_runs_without_any_data(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     pytest.importorskip("clarabel", reason="the extra 'baselines' is not installed")
+    pytest.importorskip("torch", reason="the extra 'dense' is not installed")
     assert main(["quick", "--data", str(tmp_path / "nothing"), "--out", str(tmp_path)]) == 0
     written = {path.stem for path in (tmp_path / "quick").glob("*.md")}
     assert written == set(EXPERIMENTS) - {"tshirt", "flag", "kinect_paper", "cloth"}
