@@ -47,10 +47,12 @@ class View:
             )
         if len(np.unique(points)) != N:
             raise InputError("a point is seen twice, expected each once")
+        if N and points.min() < 0:
+            raise InputError(f"a point has number {points.min()}, expected 0 or more")
         bad = ~(np.isfinite(image).all(axis=1) & np.isfinite(log_depth))
         if bad.any():
             raise InputError(f"point {points[bad][0]} is not a finite image point and depth")
-        return View(points, image, log_depth, depth_std)
+        return View(points, image, log_depth, np.where(depth_std > 0, depth_std, np.nan))
 
     def camera_points(self) -> np.ndarray:
         """(N, 3) in the camera frame, in the reconstruction's unit."""

@@ -11,6 +11,7 @@ from factors.jacobian_check import whitened_error
 from factors.keys import key
 from factors.map_motion import map_motion_factor, motion_coefficients, motion_variance
 from factors.scale_link import scale_link_factor
+from factors.surface_motion import surface_motion_factor
 
 UNIT = gtsam.noiseModel.Unit.Create(3)
 
@@ -90,6 +91,25 @@ def test_motion_is_measured_in_the_reconstructions_unit():
 def test_variance_grows_with_the_gap():
     np.testing.assert_allclose(motion_variance([[0, 1], [2, 6]]), [1.0, 4.0])
     assert motion_variance((0, 1, 2)) == 1.0
+
+
+@pytest.mark.parametrize("views", [(1, 4), (1, 2, 5)])
+def test_a_surface_moves_as_its_points_do(views):
+    """Any number of points: the same cost as point by point, with the map points where the cameras put them."""
+    rng = np.random.default_rng(5)
+    shapes = rng.normal(size=(len(views), 40, 3))
+    values, expected = gtsam.Values(), 0.0
+    for view in views:
+        values.insert(key("t", 0, view), gtsam.Pose3(gtsam.Rot3.Expmap(rng.normal(size=3)), rng.normal(size=3)))
+        values.insert(key("g", 0, view), rng.normal(0.0, 0.3, 1))
+    for point in range(40):
+        for view, shape in zip(views, shapes, strict=True):
+            pose, g = values.atPose3(key("t", 0, view)), values.atVector(key("g", 0, view))[0]
+            values.insert(key("m", point, view), pose.transformFrom(np.exp(g) * shape[point]))
+        expected += map_motion_factor(point, views, 0.1).error(values)
+    factor = surface_motion_factor(views, shapes, 0.1)
+    assert factor.error(values) == pytest.approx(expected, rel=1e-10)
+    assert factor.dim() == 3 * (3 * len(views) + 1)
 
 
 @pytest.mark.parametrize("views", [(3,), (3, 2), (1, 1), (0, 1, 2, 3)])

@@ -114,7 +114,10 @@ def test_fusion_is_better_than_odometry_and_than_alignment_frame_by_frame():
 
 
 def model_draw(rng, F=5, P=10):
-    """Views, map and measurements drawn from the very model the factors state; the cameras differ from run to run."""
+    """Views, map and measurements drawn from the very model the factors state; the cameras differ from run to run.
+
+    Half of the depths state deviations of their own, as those of a refined reconstruction do.
+    """
     noise = FusionNoise(image=2e-3, depth=0.03, motion=0.01, scale=0.02)
     g = np.concatenate([[0.0], noise.scale * rng.normal(size=F - 1)]).cumsum()
     poses = [gtsam.Pose3(gtsam.Rot3.Expmap(0.1 * rng.normal(size=3)), 0.3 * rng.normal(size=3)) for _ in range(F)]
@@ -123,19 +126,22 @@ def model_draw(rng, F=5, P=10):
     for f in range(1, F):
         m[f] = m[f - 1] + np.exp(g[f - 1]) * noise.motion * rng.normal(size=(P, 3))
     x = np.array([pose.transformTo(points.T).T for pose, points in zip(poses, m, strict=True)])
+    stated = np.where(rng.uniform(size=(F, P)) < 0.5, rng.uniform(0.002, 0.1, (F, P)), np.nan)
+    deviation = np.where(np.isnan(stated), noise.depth, stated)
     image = x[..., :2] / x[..., 2:] + noise.image * rng.normal(size=(F, P, 2))
-    log_depth = np.log(x[..., 2]) - g[:, None] + noise.depth * rng.normal(size=(F, P))
-    sightings = Sightings.checked(image, log_depth, np.ones((F, P), dtype=bool))
-    return noise, poses, g, sightings
+    log_depth = np.log(x[..., 2]) - g[:, None] + deviation * rng.normal(size=(F, P))
+    return noise, poses, g, m, Sightings.checked(image, log_depth, np.ones((F, P), dtype=bool), stated)
 
 
 def test_marginal_covariances_are_calibrated():
-    """Normalised squared error of the last camera: its mean over 200 runs lies in the 95 % interval of chi-squared."""
+    """Normalised squared errors of the last camera and of a map point: their means over 200 runs lie in the 95 %
+    intervals of chi-squared."""
     rng = np.random.default_rng(7)
-    runs, total = 200, 0.0
+    runs, camera, point = 200, 0.0, 0.0
     sigma = np.array([0.02] * 3 + [0.05] * 3)
+    model = MapModel(huber=1e6)  # Huber's loss is not the model the measurements were drawn from
     for _ in range(runs):
-        noise, poses, g, sightings = model_draw(rng)
+        noise, poses, g, m, sightings = model_draw(rng)
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         for view, pose in enumerate(poses):
             values.insert(pose_key(view), pose)
@@ -144,12 +150,16 @@ def test_marginal_covariances_are_calibrated():
         add_known_poses(graph, np.array([pose.matrix() for pose in measured]), sigma)
         unit = gtsam.noiseModel.Isotropic.Sigma(1, 0.05)
         graph.add(gtsam.PriorFactorVector(key(VIEW_SCALE, 0, 0), 0.05 * rng.normal(size=1), unit))
-        # Huber's loss is not the model the measurements were drawn from.
-        fused = fuse(sightings, noise, graph, values, FusionConfig(MapModel(huber=1e6)))
+        fused = fuse(sightings, noise, graph, values, FusionConfig(model))
         error = np.append(gtsam.Pose3(fused.poses[-1]).localCoordinates(poses[-1]), g[-1] - fused.log_scale[-1])
-        total += error @ np.linalg.solve(fused.camera_covariance[-1], error)
-    low, high = chi2.ppf([0.025, 0.975], 7 * runs) / runs
-    assert low < total / runs < high
+        camera += error @ np.linalg.solve(fused.camera_covariance[-1], error)
+        add_reconstruction(graph, values, sightings, noise, model)
+        covariance = gtsam.Marginals(graph, fused.values()).marginalCovariance(key(MAP_POINT, 3, 2))
+        error = fused.points[2, 3] - m[2, 3]
+        point += error @ np.linalg.solve(covariance, error)
+    for total, size in ((camera, 7), (point, 3)):
+        low, high = chi2.ppf([0.025, 0.975], size * runs) / runs
+        assert low < total / runs < high
 
 
 def drifting_sheet(F=20):

@@ -48,6 +48,31 @@ def test_with_a_lag_as_long_as_the_sequence_it_is_the_batch(motion):
         np.testing.assert_allclose(fusion.map_points(view), fused.points[view, seen], atol=1e-3)
 
 
+def test_view_by_view_ends_within_a_thousandth_of_the_batch():
+    """Twice the lag and more, with two relaxations on the way; `finish` then goes to the minimum."""
+    case = posed(n_frames=70, n_points=30, n_background=0, gaps=0.0)
+    fusion = grown(case)
+    online = fusion.cost()
+    fused = fusion.finish(FusionConfig(levenberg=Levenberg(max_iterations=50, tolerance=1e-8)))
+    assert fused.cost_history[0] == pytest.approx(online, rel=1e-9)
+    assert fused.cost < online < 1.001 * fused.cost
+
+
+def test_relaxation_moves_cameras_and_keeps_shapes():
+    """With the early views held too early the unit is wrong; the relaxation mends most of it."""
+    case = posed(n_frames=40, n_points=30, n_background=0, gaps=0.1)
+    fusion = grown(case, lag=5, growth=100.0)
+    before, shapes = fusion.cost(), [shape.copy() for shape in fusion.map.shape]
+    batch = fusion.finish()
+    wrong = abs(np.mean([fusion.log_scale(view) for view in range(40)]) - batch.log_scale.mean())
+    fusion.relax()
+    relaxed = abs(np.mean([fusion.log_scale(view) for view in range(40)]) - batch.log_scale.mean())
+    assert batch.cost < fusion.cost() < before
+    assert relaxed < 0.5 * wrong
+    for shape, same in zip(shapes, fusion.map.shape, strict=True):
+        np.testing.assert_array_equal(shape, same)
+
+
 def test_late_lost_and_relocalised_tracks_with_a_short_lag():
     case = posed(n_frames=30, n_points=40, gaps=0.4, seed=5)
     seen = case.sightings.seen.copy()
@@ -95,17 +120,26 @@ def test_work_per_view_does_not_grow():
 
 
 class _Throws:
+    """A user's factor that works so many times."""
+
     name = "throws"
     rows = 1
 
+    def __init__(self, works=0):
+        self.left = works
+
     def residual(self, pose):
-        raise KeyError("a user's mistake")
+        return self.jacobians(pose)[0]
 
     def jacobians(self, pose):
-        raise KeyError("a user's mistake")
+        self.left -= 1
+        if self.left < 0:
+            raise KeyError("a user's mistake")
+        return np.ones(1), [np.zeros((1, 6))]
 
 
 def bad_views(case):
+    odometry = sigmas(case.steps)
     view = case.sightings.view(4)
     nan = view.image.copy()
     nan[3, 1] = np.nan
@@ -123,6 +157,8 @@ def bad_views(case):
         "a user's mistake": ((view,), {"factors": thrower}),
         "rigid landmark of landmark 9, which has no value": ((view,), {"factors": stray}),
         "camera pose of view 2 is there already": ((view,), {"values": taken}),
+        "a point has number -1": ((View(view.points - 1, view.image, view.log_depth, view.depth_std),), {}),
+        "the cost of its factors is not a number": ((view, np.full((4, 4), np.nan), odometry[3]), {}),
         "six positive standard deviations": ((view, case.steps[3], np.zeros(6)), {}),
     }
 
@@ -142,6 +178,21 @@ def test_a_view_that_cannot_be_used_leaves_the_estimate_as_it_was():
             estimate.add_view(case.sightings.view(view), case.steps[view - 1], odometry[view - 1])
     np.testing.assert_array_equal(fusion.pose(5), twin.pose(5))
     np.testing.assert_array_equal(fusion.map_points(5), twin.map_points(5))
+
+
+@pytest.mark.parametrize("works", [2, 3, 4])
+def test_an_exception_during_the_minimisation_is_passed_on_and_changes_nothing(works):
+    case = posed(n_frames=6, n_points=20, gaps=0.0)
+    fusion, twin = grown(case, 4), grown(case, 4)
+    factors = gtsam.NonlinearFactorGraph()
+    factors.add(make_factor(_Throws(works), [pose_key(4)], [6], UNIT, readers=[gtsam.Values.atPose3]))
+    odometry = sigmas(case.steps)
+    with pytest.raises(KeyError, match="a user's mistake"):
+        fusion.add_view(case.sightings.view(4), case.steps[3], odometry[3], factors)
+    assert (fusion.n_views, fusion.graph.size()) == (4, twin.graph.size())
+    for estimate in (fusion, twin):
+        estimate.add_view(case.sightings.view(4), case.steps[3], odometry[3])
+    np.testing.assert_array_equal(fusion.pose(4), twin.pose(4))
 
 
 def test_factors_of_the_user_join_in():

@@ -1,0 +1,75 @@
+"""Views from tracks, one by one: late, lost and relocalised tracks, and views that cannot be used."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from connrsfm_graph.errors import InputError
+from connrsfm_graph.slam import LiveFusion, Sightings, fuse_live, trajectory_error
+from connrsfm_graph.slam.trajectory import chained
+from connrsfm_graph.synthetic.passing_camera import noisy_odometry, passing_camera
+from tests.connrsfm_graph.slam.scene import IMAGE_SIGMA, NOISE, sigmas
+
+F, K, P = 30, 20, 50
+"""Views, those that are known at the start, points."""
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return passing_camera(F, P, 0, seed=2)
+
+
+@pytest.fixture(scope="module")
+def image(scene):
+    return scene.image + IMAGE_SIGMA * np.random.default_rng(3).normal(size=scene.image.shape)
+
+
+def first_views(scene, image, seen):
+    """As a good reconstruction gives them, in a unit of its own."""
+    log_depth = np.log(scene.depth()[:K]) - 1.0 + 0.002 * np.random.default_rng(4).normal(size=(K, P))
+    return Sightings.checked(image[:K], log_depth, seen[:K], np.full((K, P), 0.002))
+
+
+def surface_error(scene, fusion):
+    views = range(fusion.n_views)
+    error = [fusion.map_points(view) - scene.points[view, fusion.map.views[view].points] for view in views]
+    return float(np.sqrt((np.concatenate(error) ** 2).sum(axis=1).mean()))
+
+
+def test_late_lost_and_relocalised_tracks(scene, image):
+    seen = scene.visible.copy()
+    seen[: K + 2, :5] = False  # late: known in no keyframe
+    seen[K:, 5:10] = False  # lost
+    seen[K - 4 : K + 5, 10:15] = False  # come back
+    steps, _ = noisy_odometry(scene.poses, seed=5)
+    live = fuse_live(first_views(scene, image, seen), image, seen, None, steps, scene.poses[0])
+    assert live.fusion.n_views == F
+    poses = np.array([live.fusion.pose(view) for view in range(F)])
+    odometry = trajectory_error(chained(steps, scene.poses[0]), scene.poses)
+    assert trajectory_error(poses, scene.poses).ate < 0.5 * odometry.ate
+    assert surface_error(scene, live.fusion) < 0.1
+    late = live.fusion.map.views[-1].points < 5
+    assert late.sum() == 5
+    error = np.linalg.norm(live.fusion.map_points(F - 1) - scene.points[-1, live.fusion.map.views[-1].points], axis=1)
+    assert error[late].max() < 0.2
+
+
+def test_a_view_that_cannot_be_used_changes_nothing(scene, image):
+    steps, _ = noisy_odometry(scene.poses, seed=5)
+    odometry = sigmas(steps)
+    live = LiveFusion(
+        first_views(scene, image, scene.visible), NOISE, steps[: K - 1], odometry[: K - 1], scene.poses[0]
+    )
+    points, keyframes = np.flatnonzero(scene.visible[K]), len(live.keyframes.views)
+    nan = image[K, points].copy()
+    nan[2] = np.nan
+    for message, bad in (
+        ("shares fewer than 10 tracks with every keyframe", (points + 1000, image[K, points])),
+        ("point 2 is not a finite", (points, nan)),
+        ("six positive standard deviations", (points, image[K, points], steps[K - 1], np.zeros(6))),
+    ):
+        with pytest.raises(InputError, match=f"view {K}: .*{message}.*the view was not added"):
+            live.add(*bad)
+    assert (live.fusion.n_views, len(live.keyframes.views)) == (K, keyframes)
+    assert live.add(points, image[K, points], steps[K - 1], odometry[K - 1]) == K
