@@ -56,7 +56,7 @@ Row = dict[str, str]
 
 
 def measure(options: Options) -> None:
-    """Write dense.csv and dense.md; nothing where torch is not installed."""
+    """Write dense.csv, dense.md and, of the shipped network's training, dense.png; nothing where torch is missing."""
     try:
         import torch
     except ModuleNotFoundError:
@@ -77,6 +77,7 @@ def measure(options: Options) -> None:
     text = _markdown(read_rows(path))
     (options.out / "dense.md").write_text(text, encoding="utf-8")
     print(text)
+    draw_training(checkpoint, options.out / "dense.png")
 
 
 Runs = Iterator[tuple[tuple[str, str, str], Callable[[], tuple[float, float]]]]
@@ -206,3 +207,23 @@ def _markdown(rows: list[Row]) -> str:
             lines.append(f"| {method} | {' | '.join(cells)} |")
         lines.append("")
     return "\n".join(lines)
+
+
+def draw_training(checkpoint: Checkpoint, path: Path) -> None:
+    """Error on held-out surfaces against steps of a network's training, as PNG."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    history = checkpoint.card["history"]
+    steps = [row["step"] for row in history]
+    figure, axes = plt.subplots(figsize=(6.0, 3.5))
+    for name, label in (("clean", "clean normals"), ("noisy", "20 % noise on the normals")):
+        axes.semilogy(steps, [100 * row[name] for row in history], marker="o", markersize=3, label=label)
+    axes.set(xlabel="step", ylabel="relative error of depth, percent", title=f"Training of {checkpoint.variant}")
+    axes.grid(alpha=0.3, which="both")
+    axes.legend()
+    figure.tight_layout()
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
