@@ -60,9 +60,9 @@ def run(arguments: argparse.Namespace) -> None:
             if path.suffix.lower() != ending:
                 raise InputError(f"{option} {path}: expected a name that ends in {ending}")
             check_output_folder(path.parent)
-    if arguments.save_images is not None:
-        if check_output_folder(arguments.save_images).resolve() == arguments.images.resolve():
-            raise InputError(f"--save-images {arguments.save_images}: is the folder of the images, expected another")
+    saved = arguments.save_images
+    if saved is not None and check_output_folder(saved).resolve() == arguments.images.resolve():
+        raise InputError(f"--save-images {saved}: is the folder of the images, expected another")
     config = override(TrackingConfig(), arguments.set)
     K = parse_intrinsics(arguments.intrinsics)
     distortion = None if arguments.distortion is None else parse_distortion(arguments.distortion)
@@ -72,8 +72,8 @@ def run(arguments: argparse.Namespace) -> None:
             arguments.images, K, config, arguments.masks, distortion, arguments.keyframes, progress.update
         )
     tracks = tracked.tracks
-    if arguments.save_images is not None:
-        names = _save_images(arguments.save_images, _images(arguments.images, tracks, distortion), tracks)
+    if saved is not None:
+        names = _save_images(saved, _images(arguments.images, tracks, distortion), tracks)
         tracks = replace(tracks, image_names=names)
     if arguments.picture is not None:
         _save_picture(arguments.picture, _images(arguments.images, tracked.tracks, distortion), tracks)
