@@ -34,6 +34,27 @@ def _triangle_normals(X, triangles, normal):
             normal[i] = X[i] / np.sqrt(X[i, 0] ** 2 + X[i, 1] ** 2 + X[i, 2] ** 2)
 
 
+@njit(cache=True, inline="always")
+def _solved(A, b):
+    """A^-1 b in the place of b, by Cholesky in the place of A, symmetric and positive definite."""
+    n = len(b)
+    for r in range(n):
+        for c in range(r + 1):
+            s = A[r, c]
+            for k in range(c):
+                s -= A[r, k] * A[c, k]
+            A[r, c] = np.sqrt(s) if r == c else s / A[c, c]
+    for r in range(n):
+        for k in range(r):
+            b[r] -= A[r, k] * b[k]
+        b[r] /= A[r, r]
+    for r in range(n - 1, -1, -1):
+        for k in range(r + 1, n):
+            b[r] -= A[k, r] * b[k]
+        b[r] /= A[r, r]
+    return b
+
+
 @njit(cache=True)
 def _quadrics(X, triangles, edges, normal, axis, curvature):
     """A quadric about each vertex, fitted to its neighbours' heights over the plane of its triangles' mean normal.
@@ -88,7 +109,7 @@ def _quadrics(X, triangles, edges, normal, axis, curvature):
     for i in range(P):
         for r in range(5):
             A[i, r, r] += QUADRIC_RIDGE
-        slope = np.linalg.solve(A[i], b[i])
+        slope = _solved(A[i], b[i])
         normal[i] -= slope[0] * axis[i, 0] + slope[1] * axis[i, 1]
         normal[i] /= np.sqrt(normal[i, 0] ** 2 + normal[i, 1] ** 2 + normal[i, 2] ** 2)
         size = max(scale[i], 1e-300)
