@@ -21,7 +21,7 @@ _SIGHTINGS = 2
 class KeyframeConfig:
     """How long sequences are reconstructed."""
 
-    most: int | None = 40
+    most: int | None = 32
     """Images reconstructed jointly; in a longer sequence so many keyframes are, more where tracks come and go, and the
     others follow them one by one. none: all images jointly. Needs the refinement."""
 
