@@ -75,6 +75,10 @@ def run(arguments: argparse.Namespace) -> None:
         FusionConfig(MapModel(motion=arguments.motion)), arguments.odometry_translation, arguments.odometry_rotation
     )
     tracks = load_tracks(arguments.tracks, arguments.intrinsics)
+    if not tracks.camera.kappa:
+        raise InputError(
+            f"{arguments.tracks}: seen by an orthographic camera, which has no place; expected perspective"
+        )
     times, odometry = (None, None) if arguments.odometry is None else read_tum(arguments.odometry)
     if odometry is not None and len(odometry) != tracks.n_frames:
         raise InputError(f"{arguments.odometry}: holds {len(odometry)} poses, expected one per view, {tracks.n_frames}")

@@ -32,7 +32,9 @@ class Config:
     solve: Stage = field(default_factory=Stage)
 
 
-def answer(tracks: Tracks, config: Config, progress: Progress, checkpoints: Any) -> tuple[Reconstruction, RunRecord]:
+def answer(
+    tracks: Tracks, config: Config, progress: Progress, checkpoints: Any = None
+) -> tuple[Reconstruction, RunRecord]:
     """Every surface is a gentle bowl; shaped and valued as a true result would be."""
     F, P = tracks.visible.shape
     image = tracks.normalised()

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from connrsfm_graph.progress import Progress
+from connrsfm_graph.reconstruction import Reconstruction
 from connrsfm_graph.slam import load_problem, read_tum, solve_problem, trajectory_error, write_tum
 from connrsfm_graph.slam.trajectory import chained
 from connrsfm_graph.synthetic.passing_camera import noisy_odometry, passing_camera, relative_depth
@@ -65,6 +66,42 @@ def test_without_odometry_the_unit_is_the_reconstructions(connrsfm, files, tmp_p
     assert "in the unit of the first view's reconstruction" in ended.out
 
 
+def test_odometry_that_never_moves_holds_the_camera_and_gives_no_unit(connrsfm, files, tmp_path):
+    still = tmp_path / "still.tum"
+    write_tum(still, np.tile(np.eye(4), (F, 1, 1)))
+    out = tmp_path / "out"
+    ended = connrsfm(
+        *("slam", files["tracks.npz"], "--result", files["result.npz"], "--odometry", still, "--out", out),
+    )
+    assert ended.status == 0, ended.err
+    assert "in the unit of the first view's reconstruction" in ended.out
+    _, poses = read_tum(out / "trajectory.tum")
+    assert np.abs(poses[:, :3, 3]).max() < 0.02
+
+
+def test_views_one_by_one(connrsfm, files, scene, tmp_path):
+    """The first ten reconstructed before, five more from their tracks."""
+    known = Reconstruction.load(files["result.npz"])
+    bowl, _ = answer(load_tracks(files["tracks.npz"]).select(frames=range(10)), Config(), Progress())
+    replace(bowl, points=known.points[:10], depth=known.depth[:10]).save(tmp_path / "ten.npz")
+    given = ("slam", files["tracks.npz"], "--result", tmp_path / "ten.npz", "--odometry", files["odometry.tum"])
+    out = tmp_path / "out"
+    ended = connrsfm(*given, "--live", "10", "--out", out)
+    assert ended.status == 0, ended.err
+    _, poses = read_tum(out / "trajectory.tum")
+    assert len(poses) == F
+    np.testing.assert_allclose(solve_problem(load_problem(out / "problem.npz")).poses, poses, atol=1e-3)
+    for more, message in (
+        (("--live", "2"), "--live is 2, expected 3 to 15"),
+        (("--live", "10", "--background", files["background.npz"]), "--background cannot be used with --live"),
+        (("--live", "11"), "holds 10 images and 30 points, expected"),
+    ):
+        ended = connrsfm(*given, *more, "--out", tmp_path / "other")
+        assert ended.status == 2
+        assert message in ended.err
+        assert "Traceback" not in ended.err
+
+
 def test_reconstructs_where_no_result_is_given(connrsfm, files, tmp_path):
     ended = connrsfm("slam", files["tracks.npz"], "--out", tmp_path / "out", "--odometry", files["odometry.tum"])
     assert ended.status == 0, ended.err
@@ -74,6 +111,11 @@ def test_bad_input_is_one_sentence_and_writes_nothing(connrsfm, files, tmp_path)
     out = tmp_path / "out"
     short = tmp_path / "short.tum"
     short.write_text("0 0 0 0 0 0 0 1\n")
+    with np.load(files["tracks.npz"]) as arrays:
+        np.savez(tmp_path / "far.npz", **arrays, camera="orthographic")
+    ended = connrsfm("slam", tmp_path / "far.npz", "--out", out)
+    assert ended.status == 2
+    assert "far.npz: seen by an orthographic camera" in ended.err
     given = ("slam", files["tracks.npz"], "--result", files["result.npz"], "--out", out)
     for more, message in (
         (("--odometry", short), "short.tum: holds 1 poses, expected one per view, 15"),
