@@ -130,9 +130,12 @@ def fit(task: Task, sigma_image: float) -> Fit:
     if wanted == "conformal":
         return fit_conformal(task, noise)
     isometric = fit_isometric(task, noise)
-    F, P = task.seen.shape
-    E = len(task.mesh.edges)
-    misfit = 2.0 * isometric.first_cost / max(F * E - F * P - E, 1)
+    misfit = _misfit(isometric)
+    if misfit > _MISFIT:
+        # The start may be to blame for all views alike; flat ones are neutral.
+        flat = replace(task.completed, log_depth=np.zeros_like(task.completed.log_depth))
+        again = fit_isometric(Task.of(flat, task.seen, task.config), noise)
+        isometric, misfit = min((isometric, misfit), (again, _misfit(again)), key=lambda found: found[1])
     isometric.evidence["isometric misfit"] = misfit
     if wanted == "isometric" or misfit <= _MISFIT:
         return isometric
@@ -142,6 +145,12 @@ def fit(task: Task, sigma_image: float) -> Fit:
         found.evidence["isometric misfit"] = misfit
         found.evidence["isometric over conformal cost"] = ratio
     return conformal if ratio > _RATIO else isometric
+
+
+def _misfit(found: Fit) -> float:
+    """Squared residuals of an isometric fit in assumed variances, on average over its degrees of freedom."""
+    (F, P), E = found.shape.log_depth.shape, len(found.shape.log_length)
+    return 2.0 * found.first_cost / max(F * E - F * P - E, 1)
 
 
 def fit_isometric(task: Task, noise: Noise) -> Fit:

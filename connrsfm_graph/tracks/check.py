@@ -24,6 +24,8 @@ _THIN = 1e-4
 """Points whose spread across is less than this share of their spread along lie on a line."""
 _WILD = 1e3
 """A point farther from the middle of its image than so many median distances is no point of the surface."""
+_SPREAD = (1e-6, 1e3)
+"""Image points spread over at least and at most so many focal lengths; generously more units where orthographic."""
 _STILL = 1e-8
 """Images of which less than this share of the layout changes do not differ (see `image_graph.image_change`)."""
 _COMPARISONS = 8
@@ -66,6 +68,7 @@ def check_reconstructable(tracks: Tracks, source: str = "tracks") -> tuple[Track
             f"{source}: {_frames(tracks, poor)} shows {counts[poor[0]]} points, expected at least {MIN_POINTS}; leave "
             "it out or track more points"
         )
+    _refuse_camera(tracks, source)
     _refuse_lines(tracks, source)
     _refuse_mirrored(tracks, source)
     _refuse_still(tracks, source)
@@ -109,6 +112,17 @@ def _hide_wild(tracks: Tracks) -> tuple[Tracks, list[str]]:
         f"{tracks.frame_name(frame)}, at {np.abs(tracks.pixels[frame, point]).max():.3g} pixels); they are left out"
     )
     return replace(tracks, visible=visible, pixels=np.where(visible[..., None], tracks.pixels, np.nan)), [warning]
+
+
+def _refuse_camera(tracks: Tracks, source: str) -> None:
+    """Intrinsics that leave nothing of the image, or no perspective that double precision could show."""
+    least, most = _SPREAD if tracks.camera.kappa else (_SPREAD[0] ** 10, _SPREAD[1] ** 10)
+    spread = float(np.nanmedian(np.nanstd(tracks.normalised(), axis=1)))
+    if not least < spread < most:
+        raise InputError(
+            f"{source}: the points spread over {spread:.2g} times the focal length, expected between {least:g} and "
+            f"{most:g}; do the intrinsics belong to these pixels?"
+        )
 
 
 def _refuse_lines(tracks: Tracks, source: str) -> None:

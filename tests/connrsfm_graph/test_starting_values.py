@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from connrsfm_graph.initialise import initialise
+from connrsfm_graph.metrics import evaluate
 from connrsfm_graph.problem import Problem, make_problem
-from connrsfm_graph.reconstruct import Config
+from connrsfm_graph.reconstruct import Config, reconstruct
 from connrsfm_graph.solvers.batched import BatchedBackend
 from connrsfm_graph.synthetic import spheres
 from factors.surface import planar_second_order
@@ -39,3 +40,10 @@ def test_the_pre_step_is_the_default(problem: Problem) -> None:
     assert Config().start == "pre-step"
     state = initialise(problem, BatchedBackend())
     assert np.ptp(state.first_order) > 0.0
+
+
+def test_the_refinement_finds_out_of_a_bad_start() -> None:
+    """From slopes of 45 degrees everywhere all views end in wrong shapes alike, and no model fits."""
+    tracks = spheres(n_frames=5, n_points=50).tracks
+    result, _ = reconstruct(tracks, Config(start="ones"))
+    assert evaluate(result.points, tracks.points).e3d_percent < 0.1
