@@ -62,7 +62,7 @@ def test_a_wild_observation_is_left_out(where: float) -> None:
 
 @pytest.mark.parametrize("factor", [1e300, 1e9, 1e-8])
 def test_intrinsics_of_another_world_are_refused(factor: float) -> None:
-    with pytest.raises(InputError, match="times the focal length.*do the intrinsics belong to these pixels"):
+    with pytest.raises(InputError, match=r"times the focal length.*do the intrinsics belong to these pixels"):
         check_reconstructable(Tracks.checked(views(), K * [[factor], [factor], [1.0]]))
 
 
