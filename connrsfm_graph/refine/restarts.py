@@ -1,7 +1,11 @@
 """Other starts for single views: the way out of a wrong relief or tilt.
 
 Once most views are right, so are the lengths; a view that is caught elsewhere then costs visibly more than it need.
-With the lengths held, every view is fitted from a number of simple surfaces and keeps the cheapest.
+With the lengths held, every view is fitted from a number of simple surfaces and keeps the cheapest. All are fitted
+for a few iterations, only the most promising ones to the end.
+
+Seen from afar, a bent sheet may be wrong in a part: of two bends each can be taken for its mirror image in depth.
+So isometric views are also tried with the part on one side of a line reflected about it.
 """
 
 from __future__ import annotations
@@ -19,6 +23,14 @@ _TOLERANCE = 0.02
 _BETTER = 0.9
 """A new surface must lower the view's cost to this part."""
 _TILTS = 6
+_FOLDS = (6, 3)
+"""Directions of the lines about which a part of a view is reflected, and lines in each."""
+_STRIP = 0.1
+"""Half-width of the strip whose depth makes such a line, over the extent of the image across it."""
+_SCREENING = 1
+"""Iterations after which the starts are compared."""
+_TRIED = (12, 4.0)
+"""So many of the cheapest starts are then followed to the end, where they cost at most this many times the shape."""
 _STEEP = 0.15
 """Change of log depth over the spread of the image points in a tilted start."""
 
@@ -47,16 +59,31 @@ def inverted(shape: Shape, image: np.ndarray, views: np.ndarray) -> Shape:
 def restart(measurements: Measurements, shape: Shape) -> tuple[Shape, np.ndarray]:
     """The shape with every view's cheapest surface, lengths held, and (F,) which views have a new one."""
     least = costs(measurements, shape, lag(measurements, shape))
+    first = np.stack(
+        [
+            fit_views(measurements, _scaled(measurements, start), _SCREENING, 0.0)[1]
+            for start in _starts(measurements, shape)
+        ]
+    )
+    number, factor = _TRIED
+    tried = (np.argsort(np.argsort(first, axis=0), axis=0) < number) & (first <= factor * least)
     best, renewed = shape, np.zeros(len(least), dtype=bool)
-    for start in _starts(measurements, shape):
-        trial, cost = fit_views(measurements, _scaled(measurements, start), _ITERATIONS, _TOLERANCE)
-        better = cost < _BETTER * least
-        best, least, renewed = best.with_views(better, trial), np.where(better, cost, least), renewed | better
+    for start, chosen in zip(_starts(measurements, shape), tried, strict=True):
+        if not chosen.any():
+            continue
+        views = np.flatnonzero(chosen)
+        part = measurements.views(views)
+        trial, cost = fit_views(part, _scaled(part, start.views(views)), _ITERATIONS, _TOLERANCE)
+        better = cost < _BETTER * least[views]
+        views = views[better]
+        best = best.replaced(views, trial.views(better))
+        least[views], renewed[views] = cost[better], True
     return best, renewed
 
 
 def _starts(measurements: Measurements, shape: Shape) -> Iterator[Shape]:
-    """The shape's tangent planes, its mirror images in depth, its inversion and planes tilted in all directions."""
+    """The shape's tangent planes, its mirror images in depth, as a whole and in part, or its inversion, and planes
+    tilted in all directions."""
     F, P = shape.log_depth.shape
     ray = measurements.image + shape.correction
     centred = ray - ray.mean(axis=1, keepdims=True)
@@ -69,10 +96,33 @@ def _starts(measurements: Measurements, shape: Shape) -> Iterator[Shape]:
         yield Shape(log_depth, shape.correction, shape.log_factor, shape.log_length)
     if shape.log_factor.size:
         yield inverted(shape, measurements.image, np.ones(F, dtype=bool))
+    else:
+        yield from _folded(shape, centred)
     flat = np.zeros_like(shape.log_factor)
     for angle in np.arange(_TILTS) * (2.0 * np.pi / _TILTS):
         tilt = _STEEP * (centred @ np.array([np.cos(angle), np.sin(angle)])) / spread
         yield Shape(mean + tilt, shape.correction, flat, shape.log_length)
+
+
+def _folded(shape: Shape, ray: np.ndarray) -> Iterator[Shape]:
+    """The shape with the part on one side of a line in the image (rays (F, P, 2), centred) reflected about the line.
+
+    The line's depth is linear along it, from the points near it.
+    """
+    directions, lines = _FOLDS
+    for angle in np.arange(directions) * (np.pi / directions):
+        across, along = ray @ np.array([np.cos(angle), np.sin(angle)]), ray @ np.array([-np.sin(angle), np.cos(angle)])
+        for share in np.arange(1, lines + 1) / (lines + 1):
+            offset = across - np.quantile(across, share, axis=1, keepdims=True)
+            near = np.exp(-0.5 * (offset / (_STRIP * np.ptp(across, axis=1, keepdims=True))) ** 2)
+            near /= near.sum(axis=1, keepdims=True)
+            middle, depth = ((near * values).sum(axis=1, keepdims=True) for values in (along, shape.log_depth))
+            slope = (near * (along - middle) * (shape.log_depth - depth)).sum(axis=1, keepdims=True)
+            slope /= np.maximum((near * (along - middle) ** 2).sum(axis=1, keepdims=True), 1e-300)
+            reflected = 2.0 * (depth + slope * (along - middle)) - shape.log_depth
+            for beyond in (offset > 0.0, offset < 0.0):
+                log_depth = np.where(beyond, reflected, shape.log_depth)
+                yield Shape(log_depth, shape.correction, shape.log_factor, shape.log_length)
 
 
 def _scaled(measurements: Measurements, shape: Shape) -> Shape:
