@@ -9,11 +9,11 @@ import numpy as np
 
 from connrsfm_graph.errors import ComputationError
 from connrsfm_graph.initialise import with_closed_form_scale
-from connrsfm_graph.integrate import terms_of_depth
 from connrsfm_graph.problem import Problem, State
 from connrsfm_graph.refine import Refined
 from connrsfm_graph.refine.follow import Followed
 from connrsfm_graph.solvers.separable import Solved
+from connrsfm_graph.surface_spline import terms_of_depth
 from factors.noise import PairNoise
 from factors.surface import Camera, normals
 

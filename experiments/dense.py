@@ -28,8 +28,8 @@ from connrsfm_graph.dense.simulated import Batch, simulate
 from connrsfm_graph.dense.sparse import SparsePoints
 from connrsfm_graph.dense.spline_depth import SplineDepth, on_grid
 from connrsfm_graph.dense.window import grid, slopes
-from connrsfm_graph.integrate import SurfaceSpline, choose_bending
 from connrsfm_graph.metrics.surface_normals import TRUTH, surface_normals
+from connrsfm_graph.surface_spline import SurfaceSpline, choose_bending
 from connrsfm_graph.tracks import load_tracks
 from connrsfm_graph.warps.basis import U, V
 from experiments.study import Options, append_row, read_rows
@@ -47,7 +47,7 @@ FRAME = (640, 480)
 DATA = ("tshirt", "flag", "kinect_paper")
 ENCODERS = ("compact", "resnet50", "densenet169")
 AUGMENTATION = (0.25, 0.0)
-ABLATION_STEPS, ABLATION_BATCH = 150, 16
+ABLATION_STEPS, ABLATION_BATCH = 80, 8
 _HELD_OUT = 2
 """First number of the keys of these surfaces; training and its own evaluation use others."""
 _CONTROL_POINTS, _HUBER = 14, 2.0
@@ -169,7 +169,7 @@ def _left_out(method: Callable[[list[SparsePoints]], DepthMethod], file: Path) -
 def _ablation(options: Options, checkpoint: Checkpoint) -> Runs:
     from connrsfm_graph.dense.train import TrainConfig
 
-    encoders, steps, held_out = (ENCODERS[:1], 2, 8) if options.quick else (ENCODERS, ABLATION_STEPS, 256)
+    encoders, steps, held_out = (ENCODERS[:1], 2, 8) if options.quick else (ENCODERS, ABLATION_STEPS, 128)
     for encoder, noise in product(encoders, AUGMENTATION):
         config = TrainConfig(
             variant=encoder, steps=steps, batch=ABLATION_BATCH, noise=noise, every=steps, held_out=held_out

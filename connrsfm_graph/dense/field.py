@@ -8,7 +8,7 @@ import numpy as np
 
 from connrsfm_graph.dense.spline_depth import axis_matrix
 from connrsfm_graph.dense.window import grid
-from connrsfm_graph.integrate import bending_matrix
+from connrsfm_graph.surface_spline import bending_matrix
 from connrsfm_graph.warps.basis import SplineGrid
 
 CONTROL_POINTS = 11

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from connrsfm_graph.dense.sparse import SparsePoints
-from connrsfm_graph.integrate import SurfaceSpline, choose_bending
+from connrsfm_graph.surface_spline import SurfaceSpline, choose_bending
 from connrsfm_graph.warps.basis import VALUE, SplineGrid, axis_rows
 from factors.surface import PERSPECTIVE
 

@@ -121,7 +121,7 @@ def _linearise_view(
     """Normal equations of one view; arguments before `envelope` as in `_view_cost`.
 
     Args:
-        envelope: storage of the matrix (see `elimination`).
+        envelope: storage of the matrix (see `envelope`).
         matrix: output (N,), lower triangle.
         gradient: output (n,).
         border: output (E, 2 m): derivative of each length residual by the unknowns of its two ends.

@@ -10,7 +10,8 @@ import numpy as np
 from connrsfm_graph.errors import ComputationError
 from connrsfm_graph.refine.cost import Terms, Weights, cost_kernel, hinge_stencils, linearise_kernel
 from connrsfm_graph.refine.curvature import arc_offset_kernel
-from connrsfm_graph.refine.elimination import Envelope, Factorised, NormalEquations, make_envelope
+from connrsfm_graph.refine.elimination import Factorised, NormalEquations
+from connrsfm_graph.refine.envelope import Envelope, make_envelope
 from connrsfm_graph.refine.mesh import Mesh
 from connrsfm_graph.threads import over_views
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from connrsfm_graph.errors import ComputationError, InputError
 from connrsfm_graph.initialise import with_closed_form_scale
-from connrsfm_graph.integrate import integrate, terms_of_depth
+from connrsfm_graph.integrate import integrate
 from connrsfm_graph.problem import Problem, State, flat_state, make_problem
 from connrsfm_graph.refine.cost import Weights
 from connrsfm_graph.refine.mesh import surface_mesh
@@ -23,6 +23,7 @@ from connrsfm_graph.refine.uncertainty import log_depth_deviation
 from connrsfm_graph.slam.sightings import View, stacked
 from connrsfm_graph.solvers.gtsam_backend import levenberg_marquardt, point_graph
 from connrsfm_graph.solvers.interface import PairModel
+from connrsfm_graph.surface_spline import terms_of_depth
 from connrsfm_graph.warps import WarpConfig, fit_warps
 from factors.keys import FIRST_ORDER, decode, key
 from factors.noise import PairNoise

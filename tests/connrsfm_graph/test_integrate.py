@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from connrsfm_graph.errors import ComputationError
-from connrsfm_graph.integrate import IntegrationConfig, integrate, terms_of_depth
+from connrsfm_graph.integrate import IntegrationConfig, integrate
 from connrsfm_graph.problem import flat_state, make_problem
+from connrsfm_graph.surface_spline import terms_of_depth
 from connrsfm_graph.synthetic import isometric_bending
 from factors.surface import PERSPECTIVE
 
