@@ -17,7 +17,7 @@ from experiments.missing import MISSING
 from experiments.real import FLAG, KINECT_PAPER, TSHIRT
 from experiments.study import Experiment, Options
 from experiments.summary import summarise
-from experiments.synthetic import MIXED, SPHERES
+from experiments.synthetic import MIXED, ORTHOGRAPHIC_SCENES, SPHERES
 from experiments.timing import PARALLEL, TIME
 
 TABLES: tuple[Experiment, ...] = (
@@ -33,6 +33,7 @@ TABLES: tuple[Experiment, ...] = (
     MISSING,
     FLAG,
     MIXED,
+    ORTHOGRAPHIC_SCENES,
 )
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 

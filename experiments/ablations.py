@@ -8,10 +8,9 @@ from dataclasses import replace
 from functools import partial
 
 from connrsfm_graph.reconstruct import Config, default_config
-from connrsfm_graph.synthetic import spheres
 from connrsfm_graph.tracks import Tracks, load_tracks
 from experiments.study import Case, Experiment, Options
-from experiments.synthetic import tracks_of
+from experiments.synthetic import data_set_1, tracks_of
 from factors.noise import PairNoise
 
 PAPER, DEFAULT = default_config("paper"), default_config()
@@ -28,6 +27,8 @@ LEVELS = {
     ),
     "joint": replace(DEFAULT, refinement=False),
     "pre-step, refined": replace(DEFAULT, solve=replace(DEFAULT.solve, schedule="none")),
+    "default, isometric model": replace(DEFAULT, refine=replace(DEFAULT.refine, model="isometric")),
+    "default, conformal model": replace(DEFAULT, refine=replace(DEFAULT.refine, model="conformal")),
     "default": DEFAULT,
 }
 """From the pre-step alone to everything."""
@@ -47,14 +48,14 @@ PAIRS = {
 def _data_sets(options: Options) -> Iterable[tuple[str, int, partial[Tracks]]]:
     """Spheres of every seed, and the T-shirt where it is and time allows."""
     for seed in options.seeds():
-        yield "spheres", seed, partial(tracks_of, spheres, seed)
+        yield "spheres", seed, partial(tracks_of, data_set_1(options), seed)
     if (options.data / "tshirt.npz").exists() and not options.quick:
         yield "T-shirt", 0, partial(load_tracks, options.data / "tshirt.npz")
 
 
 def _cases(column: str, settings: Mapping[str, Config], options: Options) -> Iterable[Case]:
-    """Every setting on every data set; every other one of a quick run."""
-    chosen = list(settings.items())[:: 2 if options.quick else 1]
+    """Every setting on every data set; the first and the last ones in a quick run."""
+    chosen = list(settings.items())[:: len(settings) - 1 if options.quick else 1]
     for data, seed, tracks in _data_sets(options):
         for name, config in chosen:
             yield Case({"data": data, column: name, "seed": seed}, tracks, config=replace(config, seed=seed))

@@ -21,9 +21,9 @@ from typing import Any
 
 import numba
 
+from connrsfm_graph.cli.evaluate import evaluated
 from connrsfm_graph.errors import ComputationError, InputError
 from connrsfm_graph.methods import METHODS
-from connrsfm_graph.metrics import evaluate
 from connrsfm_graph.progress import Progress
 from connrsfm_graph.reconstruct import Config, default_config
 from connrsfm_graph.synthetic import spheres
@@ -157,14 +157,7 @@ def run(case: Case) -> dict[str, str]:
     except (ComputationError, InputError) as error:
         return row | dict.fromkeys(MEASURES, "") | {FAILURE: str(error)}
     seconds = time.perf_counter() - start
-    assert tracks.points is not None, "an experiment needs tracks with truth"
-    errors = evaluate(
-        reconstruction.points,
-        tracks.points,
-        tracks.visible,
-        normals=reconstruction.normals,
-        true_normals=tracks.normals,
-    )
+    errors, _ = evaluated(reconstruction, tracks, "an experiment's tracks")
     figures = {name: getattr(errors, name) for name in MEASURES if name != "seconds"} | {"seconds": seconds}
     return row | {name: f"{value:.4g}" for name, value in figures.items()} | {FAILURE: ""}
 

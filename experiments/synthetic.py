@@ -1,4 +1,5 @@
-"""The paper's synthetic data sets: spheres related by similarities, and isometric mixed with conformal images.
+"""The paper's synthetic data sets: spheres related by similarities, and isometric mixed with conformal images; and
+spheres and bent sheets seen by orthographic cameras.
 
 Published figures belong to the paper's own random scenes, of which only the description is public.
 """
@@ -8,10 +9,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from functools import partial
 
-from connrsfm_graph.synthetic import mixed, spheres
+from connrsfm_graph.synthetic import isometric_bending, mixed, spheres
 from connrsfm_graph.synthetic.scene import Scene
 from connrsfm_graph.tracks import Tracks
 from experiments.study import VARIANTS, Case, Experiment, Options
+from factors.surface import ORTHOGRAPHIC
 
 
 def tracks_of(scene: Callable[..., Scene], seed: int) -> Tracks:
@@ -19,15 +21,21 @@ def tracks_of(scene: Callable[..., Scene], seed: int) -> Tracks:
     return scene(seed=seed).tracks
 
 
+def data_set_1(options: Options) -> Callable[..., Scene]:
+    """Maker of the paper's first data set, of a smaller one for a quick run."""
+    return partial(spheres, n_frames=4, n_points=40) if options.quick else spheres
+
+
 def _spheres(options: Options) -> Iterable[Case]:
+    scene = data_set_1(options)
     for seed in options.seeds():
         for name, (method, config) in VARIANTS.items():
-            yield Case({"method": name, "seed": seed}, partial(tracks_of, spheres, seed), method, config)
+            yield Case({"method": name, "seed": seed}, partial(tracks_of, scene, seed), method, config)
 
 
 def _mixed(options: Options) -> Iterable[Case]:
     """The cone programmes grow too large for 600 points in the time of the others; `mlh` is left out."""
-    scene = partial(mixed, n_points=100 if options.quick else 600)
+    scene = partial(mixed, n_frames=4, n_points=40) if options.quick else mixed
     for seed in options.seeds():
         for name, (method, config) in VARIANTS.items():
             if name != "mlh":
@@ -41,3 +49,26 @@ SPHERES = Experiment(
     published={("paper mode",): "0.81"},
 )
 MIXED = Experiment("mixed", "Synthetic 2: 10 images, isometric and conformal", _mixed)
+
+
+def _orthographic(options: Options) -> Iterable[Case]:
+    """Ours only: the baselines are for perspective cameras."""
+    size = {"n_frames": 4, "n_points": 40} if options.quick else {"n_frames": 7, "n_points": 100}
+    scenes = {
+        "spheres": spheres,
+        "bending": isometric_bending,
+        "bending, smooth": partial(isometric_bending, smooth=True),
+    }
+    for name, scene in scenes.items():
+        maker = partial(scene, camera=ORTHOGRAPHIC, **size)
+        for seed in options.seeds():
+            for mode in ("default", "paper mode"):
+                method, config = VARIANTS[mode]
+                yield Case(
+                    {"data": name, "method": mode, "seed": seed}, partial(tracks_of, maker, seed), method, config
+                )
+
+
+ORTHOGRAPHIC_SCENES = Experiment(
+    "orthographic", "Orthographic cameras: 7 images, 100 points, up to one mirror image in depth", _orthographic
+)

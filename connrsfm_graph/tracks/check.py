@@ -117,7 +117,8 @@ def _hide_wild(tracks: Tracks) -> tuple[Tracks, list[str]]:
 def _refuse_camera(tracks: Tracks, source: str) -> None:
     """Intrinsics that leave nothing of the image, or no perspective that double precision could show."""
     least, most = _SPREAD if tracks.camera.kappa else (_SPREAD[0] ** 10, _SPREAD[1] ** 10)
-    spread = float(np.nanmedian(np.nanstd(tracks.normalised(), axis=1)))
+    with np.errstate(over="ignore", invalid="ignore"):
+        spread = float(np.nanmedian(np.nanstd(tracks.normalised(), axis=1)))
     if not least < spread < most:
         raise InputError(
             f"{source}: the points spread over {spread:.2g} times the focal length, expected between {least:g} and "
