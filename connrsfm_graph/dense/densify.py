@@ -19,10 +19,13 @@ from connrsfm_graph.export.mesh import TexturedMesh, default_step, mesh_of_depth
 from connrsfm_graph.export.ply import write_ply
 from connrsfm_graph.files import folder_written_beside
 from connrsfm_graph.reconstruction import Reconstruction
+from connrsfm_graph.report.mesh import triangles
 from connrsfm_graph.tracks.images import ImageSequence, Source
 
 FEWEST_POINTS = 10
 """Images with fewer sparse points have no dense surface."""
+NARROWEST = 4.0
+"""Pixels that the points of an image with a dense surface span along either axis."""
 SEQUENCE_CELLS = 80
 """Cells along the longer side of a surface of the animation."""
 SEQUENCE_TEXTURE = 512
@@ -55,10 +58,10 @@ def densify(
             enough points; and those of `dense.choose`.
     """
     sparse = [SparsePoints.of(reconstruction, f) for f in range(reconstruction.n_frames)]
-    usable = [f for f, points in enumerate(sparse) if len(points) >= FEWEST_POINTS]
+    problems = [_problem(points) for points in sparse]
+    usable = [f for f, problem in enumerate(problems) if problem is None]
     if not usable:
-        most = max(map(len, sparse))
-        raise InputError(f"no image has {FEWEST_POINTS} recovered points (the most are {most}), too few for a surface")
+        raise InputError(f"no image has a dense surface; {reconstruction.frame_name(0)} has {problems[0]}")
     start = time.perf_counter()
     choice = choose([sparse[f] for f in usable], method, checkpoint)
     fitting = (time.perf_counter() - start) / len(usable)
@@ -74,16 +77,13 @@ def densify(
                 size = image.shape[1], image.shape[0]
                 warnings += _camera_warnings(points.K, size)
             _check_inside(reconstruction, f, size, images)
-            if f not in usable:
-                problem: str | None = f"{len(points)} recovered points, a surface needs {FEWEST_POINTS}"
+            problem = problems[f]
+            if problem is None:
+                writer.add(f, name, points, choice.method, usable.index(f), image)
             else:
-                problem = writer.add(f, name, points, choice.method, usable.index(f), image)
-            if problem is not None:
                 skipped.append({"frame": f, "name": name, "reason": problem})
             if progress is not None:
                 progress(f + 1, reconstruction.n_frames)
-        if not writer.frames:
-            raise InputError("the points of no image span a surface, so that there is nothing to make dense")
         writer.write_sequence()
         index = DenseIndex(
             method=choice.method.name,
@@ -111,16 +111,12 @@ class _Writer:
         self.frames: list[DenseFrame] = []
         self._coarse: list[tuple[TexturedMesh, bytes]] = []
 
-    def add(
-        self, f: int, name: str, points: SparsePoints, method: DepthMethod, number: int, image: np.ndarray
-    ) -> str | None:
-        """Make and write the surface of image `f`, the method's image `number`; why there is none, or None."""
+    def add(self, f: int, name: str, points: SparsePoints, method: DepthMethod, number: int, image: np.ndarray) -> None:
+        """Make and write the surface of image `f`, the method's image `number`."""
         start = time.perf_counter()
         size = image.shape[1], image.shape[0]
         depth = np.where(surface_region(points.pixels, size), method.depth(number, size), np.nan)
         mesh = mesh_of_depth(depth, points.K)
-        if not len(mesh.triangles):
-            return "its points span no surface"
         residual = method.depth_at(number, points.pixels) / points.depth - 1.0
         files = self._write(f, name, depth, mesh, image)
         self.frames.append(
@@ -138,7 +134,6 @@ class _Writer:
         )
         coarse = mesh_of_depth(depth, points.K, default_step(depth, SEQUENCE_CELLS))
         self._coarse.append((coarse, jpeg_of(image, SEQUENCE_TEXTURE)))
-        return None
 
     def write_sequence(self) -> None:
         """Write the animation of all surfaces so far."""
@@ -164,6 +159,15 @@ class _Writer:
         write_glb(self.folder / files["glb"], mesh, jpeg, name)
         write_ply(self.folder / files["ply"], mesh, image)
         return files
+
+
+def _problem(points: SparsePoints) -> str | None:
+    """What an image lacks for a dense surface, None where nothing."""
+    if len(points) < FEWEST_POINTS:
+        return f"{len(points)} recovered points, a surface needs {FEWEST_POINTS}"
+    if np.ptp(points.pixels, axis=0).min() < NARROWEST or not len(triangles(points.pixels)):
+        return "points on a line"
+    return None
 
 
 def _images_of(reconstruction: Reconstruction, source: Source) -> Iterator[np.ndarray]:

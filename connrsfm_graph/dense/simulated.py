@@ -27,7 +27,7 @@ SLOPE = (0.2, 1.6)
 OBSERVED = (60, 400)
 """Range of the number of points whose normals are known."""
 CLEAN = 0.3
-"""Part of the surfaces without noise; the others have any up to `Simulated.noise`."""
+"""Part of the surfaces without noise, where others have some."""
 HOLES = 0.3
 """Part of the surfaces with a hole."""
 _FIT_RIDGE = 0.01
@@ -52,8 +52,6 @@ class Batch:
     """(B, N, 3) their normals of the log-depth surface, with noise."""
     observed: np.ndarray
     """(B, N) bool, the point exists."""
-    point_log_depth: np.ndarray
-    """(B, N) true log depth of the observed points, on the scale of `log_depth`."""
 
 
 def simulate(count: int, size: int, key: tuple[int, ...], noise: tuple[float, float]) -> Batch:
@@ -78,7 +76,7 @@ def simulate(count: int, size: int, key: tuple[int, ...], noise: tuple[float, fl
     order = np.argsort(~observed, axis=1, kind="stable")[:, : OBSERVED[1]]
     p, observed = np.take_along_axis(p, order[..., None], axis=1), np.take_along_axis(observed, order, axis=1)
 
-    value, du, dv = (np.einsum("bnk,bk->bn", part, coefficients) for part in _monomials(p))
+    _, du, dv = (np.einsum("bnk,bk->bn", part, coefficients) for part in _monomials(p))
     image = centre[:, None] + p * half[:, None]
     y = np.stack([du, dv], axis=-1) / half[:, None]
     n = np.concatenate([y, -(1.0 + (y * image).sum(axis=-1, keepdims=True))], axis=-1)
@@ -99,7 +97,6 @@ def simulate(count: int, size: int, key: tuple[int, ...], noise: tuple[float, fl
         p,
         m,
         observed,
-        value - mean[:, None],
     )
 
 

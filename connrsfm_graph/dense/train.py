@@ -33,7 +33,7 @@ class TrainConfig:
 
     variant: str = "compact"
     """Name in `network.VARIANTS`."""
-    steps: int = 2400
+    steps: int = 1600
     """Batches in all; the only setting that may change when a training goes on."""
     batch: int = 32
     """Surfaces per batch."""

@@ -88,8 +88,16 @@ def test_images_with_few_points_are_left_out_with_a_reason(tmp_path: Path, image
     index = densify(replace(true, visible=visible), images, tmp_path, "spline")
     assert [frame.frame for frame in index.frames] == [0, 2]
     assert [(item["frame"], item["name"]) for item in index.skipped] == [(1, "001.png")]
-    with pytest.raises(InputError, match="no image has 10 recovered points"):
+    with pytest.raises(InputError, match=r"no image has a dense surface; 000\.png has 0 recovered points"):
         densify(replace(true, visible=np.zeros_like(visible)), images, tmp_path, "spline")
+
+
+def test_points_on_a_line_span_no_surface(tmp_path: Path, images: Path) -> None:
+    true = sheet()
+    points = true.points.copy()
+    points[1, :, 1] = 0.1 * points[1, :, 2]
+    index = densify(replace(true, points=points), images, tmp_path, "spline")
+    assert [(item["frame"], item["reason"]) for item in index.skipped] == [(1, "points on a line")]
 
 
 def test_images_are_found_by_name_among_more(tmp_path: Path) -> None:

@@ -30,9 +30,8 @@ def test_surfaces_are_polynomials_of_fifth_degree_with_their_own_normals() -> No
     batch = simulate(8, 64, (0, 1), (0.0, 0.0))
     p = np.stack(np.meshgrid(grid(64), grid(64)), axis=-1).reshape(-1, 2)
     rows = np.stack([p[:, 0] ** i * p[:, 1] ** j for i in range(6) for j in range(6 - i)], axis=1)
-    for log_depth, mask, points, m, seen, value in zip(
-        batch.log_depth, batch.mask, batch.p, batch.m, batch.observed, batch.point_log_depth, strict=True
-    ):
+    parts = (batch.log_depth, batch.mask, batch.p, batch.m, batch.observed)
+    for log_depth, mask, points, m, seen in zip(*parts, strict=True):
         fitted = np.linalg.lstsq(rows, log_depth.ravel().astype(float))[0]
         assert np.abs(rows @ fitted - log_depth.ravel()).max() < 1e-5
         assert abs(log_depth[mask].mean()) < 1e-6
@@ -43,7 +42,6 @@ def test_surfaces_are_polynomials_of_fifth_degree_with_their_own_normals() -> No
             for s in (np.zeros(2), np.array([1, 0]), np.array([0, 1]))
         ]
         base, right, down = (r @ fitted for r in shifted)
-        assert base == pytest.approx(value[seen], abs=1e-5)
         gradient = np.stack([right - base, down - base], axis=1) / h
         gentle = np.abs(gradient).max(axis=1) < 3.0  # steeper ones are limited
         assert slopes(m[seen])[gentle] == pytest.approx(gradient[gentle], abs=2e-3)
