@@ -51,7 +51,7 @@ def run(arguments: argparse.Namespace) -> None:
     from connrsfm_graph.files import check_output_folder
     from connrsfm_graph.progress import Progress
     from connrsfm_graph.tracks import parse_intrinsics, save_tracks
-    from connrsfm_graph.tracks.follow import TrackingConfig
+    from connrsfm_graph.tracks.config import TrackingConfig
     from connrsfm_graph.tracks.front_end import images_to_tracks
     from connrsfm_graph.tracks.lens import parse_distortion
 

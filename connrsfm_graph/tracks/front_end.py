@@ -12,7 +12,8 @@ import numpy as np
 
 from connrsfm_graph.errors import InputError
 from connrsfm_graph.tracks.check import MIN_FRAMES
-from connrsfm_graph.tracks.follow import TrackingConfig, track_images
+from connrsfm_graph.tracks.config import TrackingConfig
+from connrsfm_graph.tracks.follow import track_images
 from connrsfm_graph.tracks.images import Source
 from connrsfm_graph.tracks.keyframes import keyframes
 from connrsfm_graph.tracks.lens import undistort_pixels

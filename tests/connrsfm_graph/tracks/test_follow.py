@@ -12,8 +12,9 @@ import pytest
 from connrsfm_graph.errors import InputError
 from connrsfm_graph.synthetic.rendered import RenderConfig, RenderedSequence, render_sequence
 from connrsfm_graph.tracks import Tracks, check_reconstructable, parse_intrinsics
+from connrsfm_graph.tracks.config import TrackingConfig
 from connrsfm_graph.tracks.corners import corners, not_black
-from connrsfm_graph.tracks.follow import TrackingConfig, track_images
+from connrsfm_graph.tracks.follow import track_images
 from connrsfm_graph.tracks.neighbours import local_affinity
 from connrsfm_graph.tracks.register import patches, register
 
