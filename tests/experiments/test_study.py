@@ -107,4 +107,14 @@ def test_the_summary_says_where_the_default_mode_is_behind(options: Options) -> 
     summarise(options)
     text = (options.out / "summary.md").read_text()
     assert "**0.40**" in text
-    assert "mlh is ahead of our default mode" in text
+    assert "mlh ahead of our default mode" in text
+
+
+def test_errors_that_print_alike_are_a_tie(options: Options) -> None:
+    options.out.mkdir()
+    for method, error in (("default", 2e-5), ("mlh", 1e-7)):
+        study.append_row(options.out / f"{SOURCES[0].name}.csv", row(method, 0, error))
+    summarise(options)
+    text = (options.out / "summary.md").read_text()
+    assert text.count("**0.00**") == 2
+    assert "Our default mode is ahead on every line." in text
