@@ -22,14 +22,15 @@ from connrsfm_graph.metrics.alignment import align_similarity
 from connrsfm_graph.slam.assemble import MapModel, link_scales, pose_key
 from connrsfm_graph.slam.elimination import MapState, MapTerms
 from connrsfm_graph.slam.fuse import GAUGE_SIGMA, Fused, FusionConfig, fuse
+from connrsfm_graph.slam.growing_graph import GrowingGraph, push_back, try_out
 from connrsfm_graph.slam.growing_map import GrowingMap
 from connrsfm_graph.slam.minimise import camera_arrays
 from connrsfm_graph.slam.noise import FusionNoise
 from connrsfm_graph.slam.relaxation import relaxed
 from connrsfm_graph.slam.sightings import Sightings, View
-from connrsfm_graph.slam.window import Window, camera_keys, is_camera
+from connrsfm_graph.slam.window import Window
 from connrsfm_graph.solvers.interface import Levenberg
-from factors.keys import LOG_DEPTH, MAP_POINT, VIEW_SCALE, decode, describe, key
+from factors.keys import VIEW_SCALE, describe, key
 
 _FEWEST = 4
 """Points from which the pose of a view without odometry is predicted."""
@@ -81,18 +82,21 @@ class IncrementalFusion:
         self.config = config or IncrementalConfig()
         self.map = GrowingMap(self.config.map.window)
         """What the views saw and where their points are."""
-        self.graph = gtsam.NonlinearFactorGraph()
-        """All factors but those of the map and the links between scales."""
+        self._factors = GrowingGraph()
         self.values = gtsam.Values()
         """Current estimate of all variables but those of the map."""
         self._first = gtsam.Pose3() if first is None else gtsam.Pose3(first)
         self._log_scale = log_scale
         self._relaxed = self.config.lag  # views at the last relaxation; before, the window holds all
-        self._touching: dict[int, list[int]] = {}  # indices in the graph of the factors on a variable
 
     @property
     def n_views(self) -> int:
         return self.map.n_views
+
+    @property
+    def graph(self) -> gtsam.NonlinearFactorGraph:
+        """All factors but those of the map and the links between scales."""
+        return self._factors.graph
 
     def add_view(
         self,
@@ -131,14 +135,16 @@ class IncrementalFusion:
                 if taken:
                     raise InputError(f"{describe(taken[0])} is there already")
                 new.insert(values)
-            graph = self._factors(number, pose, scale, step, sigmas)
+            graph = self._poses(number, pose, scale, step, sigmas)
             if factors is not None:
-                graph.push_back(factors)
+                push_back(graph, factors)
             trial = gtsam.Values(self.values)
             trial.insert(new)
-            _try_out(graph, new, trial)
+            try_out(graph, new, trial)
             first = max(0, number - self.config.lag + 1)
-            tied = self._tied(first, number, graph)
+            tied = self._factors.around(first, number, graph, recent=number - 2 * self.config.lag)
+            for n in range(max(1, first), number + 1):
+                tied.add(link_scales(n - 1, n, self.noise))
             window = Window(self.map, view, first, tied, trial, self.noise, self.config.map)
             state, estimate = window.minimise(self.config.levenberg)
         except InputError as error:
@@ -146,10 +152,7 @@ class IncrementalFusion:
         # Nothing can fail from here on.
         trial.update(estimate)
         self.values = trial
-        for n in range(graph.size()):
-            for k in graph.at(n).keys():
-                self._touching.setdefault(k, []).append(self.graph.size() + n)
-        self.graph.push_back(graph)
+        self._factors.append(graph)
         self.map.append(view)
         window.store(state)
         return number
@@ -211,7 +214,7 @@ class IncrementalFusion:
         _, R, t = align_similarity(np.exp(scale) * view.camera_points()[known], target)
         return gtsam.Pose3(gtsam.Rot3(R), t), scale
 
-    def _factors(
+    def _poses(
         self, number: int, pose: gtsam.Pose3, scale: float, step: np.ndarray | None, sigmas: np.ndarray | None
     ) -> gtsam.NonlinearFactorGraph:
         """Gauge of the first view, odometry of every other."""
@@ -228,46 +231,3 @@ class IncrementalFusion:
             noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
             graph.add(gtsam.BetweenFactorPose3(pose_key(number - 1), pose_key(number), gtsam.Pose3(step), noise))
         return graph
-
-    def _tied(self, first: int, number: int, new: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGraph:
-        """Factors on the cameras from `first` on, and recent ones of the other variables in them."""
-        recent = number - 2 * self.config.lag
-
-        def found(keys: set[int]) -> set[int]:
-            return {n for k in keys for n in self._touching.get(k, [])}
-
-        def last_view(factor: gtsam.NonlinearFactor) -> int:
-            return max((decode(k)[2] for k in factor.keys() if is_camera(k)), default=number)
-
-        direct = found({k for n in range(first, number + 1) for k in camera_keys(n)})
-        graph = gtsam.NonlinearFactorGraph()
-        for n in range(max(1, first), number + 1):
-            graph.add(link_scales(n - 1, n, self.noise))
-        factors = [self.graph.at(n) for n in direct] + [new.at(n) for n in range(new.size())]
-        others = {k for factor in factors for k in factor.keys() if not is_camera(k)}
-        indirect = [self.graph.at(n) for n in sorted(found(others) - direct)]
-        for factor in [*factors, *(factor for factor in indirect if last_view(factor) >= recent)]:
-            graph.push_back(factor)
-        return graph
-
-
-def _try_out(graph: gtsam.NonlinearFactorGraph, new: gtsam.Values, values: gtsam.Values) -> None:
-    """Evaluate new factors at the values they would meet, so that a fault is told by name."""
-    needed = set(graph.keyVector())
-    mapped = [k for k in needed if decode(k)[0] in (LOG_DEPTH, MAP_POINT)]
-    if mapped:
-        raise InputError(f"a factor is on {describe(mapped[0])}, expected none on the map while it grows")
-    missing = [k for k in needed if not values.exists(k)]
-    if missing:
-        raise InputError(f"a factor asks for {describe(missing[0])}, which has no value")
-    idle = [k for k in new.keys() if k not in needed and not is_camera(k)]
-    if idle:
-        raise InputError(f"{describe(idle[0])} is in no factor")
-    try:
-        graph.linearize(values)
-        cost = graph.error(values)
-    except Exception as error:  # whatever a user's factor throws
-        told = str(error).strip().partition("\n")[0][:200]
-        raise InputError(f"a factor cannot be evaluated ({type(error).__name__}: {told})") from error
-    if not np.isfinite(cost):
-        raise InputError("the cost of its factors is not a number")

@@ -62,7 +62,8 @@ class Window:
                 rows.setdefault(n, []).append(row)
         self.numbers = sorted(rows)
         # Columns of the arrays are points in ascending order.
-        self.rows = [np.array(rows[n])[np.argsort(views[n].points[rows[n]])] for n in self.numbers]
+        chosen = {n: np.array(mine, dtype=int) for n, mine in rows.items()}
+        self.rows = [chosen[n][np.argsort(views[n].points[chosen[n]])] for n in self.numbers]
         held = np.array(self.numbers) < first
         sightings = stacked([views[n] for n in self.numbers], self.rows, points)
         self.terms = MapTerms(sightings, noise, model, np.array(self.numbers), held)

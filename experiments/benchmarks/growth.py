@@ -16,14 +16,11 @@ from pathlib import Path
 
 import numpy as np
 
-from connrsfm_graph.slam import FusionConfig, IncrementalFusion, SlamConfig, trajectory_error
-from connrsfm_graph.solvers.interface import Levenberg
+from connrsfm_graph.slam import IncrementalFusion, SlamConfig, trajectory_error
 from experiments.slam import Case, simulated_case
 
 AROUND = 10
 """Time per view is the median over this many views before and after."""
-TIGHT = Levenberg(max_iterations=50, tolerance=1e-8)
-"""Of the batch that the incremental estimate is compared with."""
 
 
 def grow(case: Case) -> tuple[IncrementalFusion, np.ndarray]:
@@ -48,7 +45,7 @@ def report(case: Case, fusion: IncrementalFusion, milliseconds: np.ndarray) -> s
     fusion.relax()
     relaxation = time.process_time() - started
     started = time.process_time()
-    fused = fusion.finish(FusionConfig(levenberg=TIGHT))
+    fused = fusion.finish()
     finish = time.process_time() - started
     return "\n".join(
         [

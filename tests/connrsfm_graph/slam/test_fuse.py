@@ -271,6 +271,19 @@ def test_noise_levels_are_found_from_the_views_alone():
     assert 0.5 < noise.motion / motion < 2.0
 
 
+def test_depths_that_state_their_noise_leave_their_change_to_motion():
+    """Errors that neighbouring views share do not show in the views' differences; motion along the rays does."""
+    case = posed(n_frames=60, n_points=60, gaps=0.0, seed=2)
+    bias = 0.02 * np.random.default_rng(0).normal(size=60)
+    sightings = Sightings.checked(
+        case.scene.image, np.log(case.scene.depth()) + bias, case.scene.visible, np.full((60, 60), 0.02)
+    )
+    noise = estimate_noise(sightings, 1e-3)
+    assert noise.depth == pytest.approx(0.02)
+    motion = np.sqrt((np.diff(case.scene.points, axis=0) ** 2).mean())
+    assert 0.7 < noise.motion / motion < 1.5
+
+
 def test_common_scale_and_nearest_point():
     scene = passing_camera(20, 30, 5, swing=0.0)
     rigid = Sightings.checked(scene.image, np.log(scene.depth() / 7.0), scene.visible)
