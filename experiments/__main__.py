@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from experiments import accuracy, cloth, dense, theorem
+from experiments import accuracy, cloth, dense, slam, theorem
 from experiments.ablations import ABLATION, EDGES, ITERATIONS, STARTING_VALUES
 from experiments.missing import MISSING
 from experiments.real import FLAG, KINECT_PAPER, TSHIRT
@@ -44,12 +44,19 @@ def verify_theorem(options: Options) -> None:
     theorem.main(["--out", str(options.out), *size])
 
 
+def fuse_with_poses(options: Options) -> None:
+    """Deformable fusion against its parts, see `experiments.slam`."""
+    size = ["--frames", "60", "--points", "60", "--real-frames", "0"] if options.quick else []
+    slam.main(["--out", str(options.out), *size])
+
+
 EXPERIMENTS: dict[str, Callable[[Options], None]] = {
     "theorem": verify_theorem,
     **{experiment.name: experiment for experiment in TABLES},
     "cloth": cloth.measure,
     "dense": dense.measure,
     "accuracy": accuracy.measure,
+    "slam": fuse_with_poses,
     "summary": summarise,
 }
 """By name, in the order in which `all` runs them; one more entry adds one."""

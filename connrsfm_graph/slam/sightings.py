@@ -110,7 +110,13 @@ class Sightings:
 
     @staticmethod
     def of(reconstruction: Reconstruction) -> Sightings:
-        """Sightings of the observed points of a reconstruction; interpolated points and outliers are left out."""
+        """Sightings of the observed points of a reconstruction; interpolated points and outliers are left out.
+
+        Raises:
+            InputError: the camera was orthographic, which has no place in the world.
+        """
+        if not reconstruction.camera.kappa:
+            raise InputError("the reconstruction is of an orthographic camera, which has no place; expected perspective")
         recovered = reconstruction.recovered
         seen = recovered & reconstruction.visible & ~reconstruction.interpolated & ~reconstruction.outlier
         points = np.where(recovered[..., None], reconstruction.points, 1.0)
