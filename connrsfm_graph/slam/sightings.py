@@ -116,7 +116,9 @@ class Sightings:
             InputError: the camera was orthographic, which has no place in the world.
         """
         if not reconstruction.camera.kappa:
-            raise InputError("the reconstruction is of an orthographic camera, which has no place; expected perspective")
+            raise InputError(
+                "the reconstruction is of an orthographic camera, which has no place; expected perspective"
+            )
         recovered = reconstruction.recovered
         seen = recovered & reconstruction.visible & ~reconstruction.interpolated & ~reconstruction.outlier
         points = np.where(recovered[..., None], reconstruction.points, 1.0)

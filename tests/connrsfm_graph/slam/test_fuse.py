@@ -14,7 +14,6 @@ from connrsfm_graph.slam import (
     FusionNoise,
     MapModel,
     Sightings,
-    SlamConfig,
     add_reconstruction,
     estimate_noise,
     fuse,
@@ -23,14 +22,13 @@ from connrsfm_graph.slam import (
     solve_problem,
     trajectory_error,
 )
-from connrsfm_graph.slam.cameras import add_known_poses, common_scale, nearest_point
+from connrsfm_graph.slam.cameras import add_known_poses
 from connrsfm_graph.slam.elimination import MapTerms
 from connrsfm_graph.slam.fuse import GAUGE_SIGMA
 from connrsfm_graph.slam.minimise import Columns, camera_arrays, damped_step
-from connrsfm_graph.slam.trajectory import chained, steps_between
+from connrsfm_graph.slam.trajectory import chained
 from connrsfm_graph.solvers.gtsam_backend import damped, levenberg_marquardt
 from connrsfm_graph.solvers.interface import Levenberg
-from connrsfm_graph.synthetic.passing_camera import noisy_odometry, passing_camera
 from factors.keys import CAMERA_POSE, LOG_DEPTH, MAP_POINT, VIEW_SCALE, decode, describe, key
 from tests.connrsfm_graph.slam.scene import NOISE, posed
 
@@ -162,56 +160,6 @@ def test_marginal_covariances_are_calibrated():
         assert low < total / runs < high
 
 
-def drifting_sheet(F=20):
-    """A camera that passes before a wall; a stiff sheet between them drifts across its path, ever faster."""
-    rng = np.random.default_rng(3)
-    poses = np.tile(np.eye(4), (F, 1, 1))
-    poses[:, 0, 3] = np.linspace(0.0, 1.5, F)
-    sheet = np.column_stack([rng.uniform(-0.6, 0.6, (30, 2)), 3.0 + 0.3 * rng.normal(size=30)])
-    points = sheet + np.outer(0.3 * np.linspace(0.0, 1.0, F) ** 2, [0.0, 1.0, 0.0])[:, None]
-    wall = np.column_stack([rng.uniform(-2, 3.5, 40), rng.uniform(-2, 2, 40), rng.uniform(4, 6, 40)])
-    x, w = points - poses[:, None, :3, 3], wall - poses[:, None, :3, 3]
-    sightings = Sightings.checked(x[..., :2] / x[..., 2:], np.log(x[..., 2] / 3.0), np.ones((F, 30), dtype=bool))
-    return poses, points, sightings, (w[..., :2] / w[..., 2:], np.ones((F, 40), dtype=bool))
-
-
-STIFF = FusionNoise(image=1e-3, depth=0.01, motion=0.02, scale=0.01)
-
-
-def drift(fused):
-    return (fused.points[-1] - fused.points[0]).mean(axis=0)
-
-
-def test_gauge_of_images_alone_the_surface_rests_and_the_camera_does_all_the_moving():
-    poses, points, sightings, _ = drifting_sheet()
-    fused = solve_problem(pose_problem(sightings, noise=STIFF))
-    np.testing.assert_allclose(drift(fused), 0.0, atol=1e-9)
-    relative = poses[-1, :3, 3] - (points[-1] - points[0]).mean(axis=0)
-    # In the unit of the first view's reconstruction, a third of the world's.
-    np.testing.assert_allclose(fused.poses[-1, :3, 3], relative / 3.0, atol=1e-6)
-
-
-@pytest.mark.parametrize(("with_background", "low", "high"), [(False, 0.0, 0.1), (True, 0.29, 0.31)])
-def test_gauge_deformation_is_least_until_a_rigid_background_decides(with_background, low, high):
-    """Odometry of good length and bad direction: the drift of 0.3 is told from the camera's by the wall alone."""
-    poses, _, sightings, background = drifting_sheet()
-    steps, _ = noisy_odometry(poses, translation=0.02, rotation_deg=5.0, seed=1)
-    config = SlamConfig(odometry_rotation_deg=5.0)
-    fused = solve_problem(pose_problem(sightings, config, STIFF, steps, background if with_background else None))
-    assert low < drift(fused)[1] < high
-
-
-def test_gauge_a_surface_that_moves_in_proportion_to_the_camera_is_a_larger_one_at_rest():
-    """No background can tell: half as fast as the camera at distance 3 is at rest at distance 6."""
-    poses, points, _, background = drifting_sheet()
-    points = points[:1] + 0.5 * poses[:, None, :3, 3]
-    x = points - poses[:, None, :3, 3]
-    sightings = Sightings.checked(x[..., :2] / x[..., 2:], np.log(x[..., 2] / 3.0), np.ones(x.shape[:2], dtype=bool))
-    fused = solve_problem(pose_problem(sightings, noise=STIFF, steps=steps_between(poses), background=background))
-    np.testing.assert_allclose(drift(fused), 0.0, atol=1e-3)
-    np.testing.assert_allclose(np.exp(fused.log_scale), 6.0, rtol=0.01)
-
-
 def test_a_users_graph_keeps_its_keys_and_its_optimiser():
     case = posed(n_frames=5, n_points=8)
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -250,45 +198,3 @@ def test_fuse_names_what_is_missing():
     blind = Sightings.checked(case.sightings.image, case.sightings.log_depth, np.zeros((3, 8), dtype=bool))
     with pytest.raises(InputError, match="view 0 sees no point"):
         fuse(blind, NOISE, gtsam.NonlinearFactorGraph(), values)
-
-
-def test_sightings_refuse_what_is_not_a_number():
-    image, log_depth, seen = np.zeros((2, 3, 2)), np.zeros((2, 3)), np.ones((2, 3), dtype=bool)
-    log_depth[1, 2] = np.nan
-    with pytest.raises(InputError, match="point 2 of view 1 is not a finite"):
-        Sightings.checked(image, log_depth, seen)
-    seen[1, 2] = False
-    assert Sightings.checked(image, log_depth, seen).log_depth[1, 2] == 0.0
-
-
-def test_noise_levels_are_found_from_the_views_alone():
-    """Depth noise to a fifth; motion to a factor of two: it is read across the rays, the sheet waves along them."""
-    case = posed(n_frames=60, n_points=60, gaps=0.0, seed=2)
-    noise = estimate_noise(case.sightings, 1e-3)
-    unit = np.exp(np.mean(np.log(case.scene.depth()) - case.sightings.log_depth))
-    motion = np.sqrt((np.diff(case.scene.points, axis=0) ** 2).mean()) / unit
-    assert noise.depth == pytest.approx(0.02, rel=0.2)
-    assert 0.5 < noise.motion / motion < 2.0
-
-
-def test_depths_that_state_their_noise_leave_their_change_to_motion():
-    """Errors that neighbouring views share do not show in the views' differences; motion along the rays does."""
-    case = posed(n_frames=60, n_points=60, gaps=0.0, seed=2)
-    bias = 0.02 * np.random.default_rng(0).normal(size=60)
-    sightings = Sightings.checked(
-        case.scene.image, np.log(case.scene.depth()) + bias, case.scene.visible, np.full((60, 60), 0.02)
-    )
-    noise = estimate_noise(sightings, 1e-3)
-    assert noise.depth == pytest.approx(0.02)
-    motion = np.sqrt((np.diff(case.scene.points, axis=0) ** 2).mean())
-    assert 0.7 < noise.motion / motion < 1.5
-
-
-def test_common_scale_and_nearest_point():
-    scene = passing_camera(20, 30, 5, swing=0.0)
-    rigid = Sightings.checked(scene.image, np.log(scene.depth() / 7.0), scene.visible)
-    assert common_scale(rigid, scene.poses, NOISE, 1e-3) == pytest.approx(np.log(7.0), abs=0.01)
-    poses = [gtsam.Pose3(gtsam.Rot3(), np.array([x, 0.0, 0.0])) for x in (-1.0, 0.0, 1.0)]
-    point = np.array([0.2, 0.1, 4.0])
-    image = np.array([pose.transformTo(point)[:2] / pose.transformTo(point)[2] for pose in poses])
-    np.testing.assert_allclose(nearest_point(poses, image, 4.0), point, atol=1e-9)
