@@ -1,6 +1,7 @@
 """Tables and figures from one command: `python -m experiments all`, `quick`, or names.
 
 Every experiment writes NAME.csv, NAME.md and NAME.png into the results folder and goes on where it was interrupted.
+`publish` after them puts the tables into the pages that show them.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from pathlib import Path
 from experiments import accuracy, cloth, dense, slam, theorem
 from experiments.ablations import ABLATION, EDGES, ITERATIONS, STARTING_VALUES
 from experiments.missing import MISSING
+from experiments.publish import publish
 from experiments.real import FLAG, KINECT_PAPER, TSHIRT
 from experiments.study import Experiment, Options
 from experiments.summary import summarise
@@ -68,9 +70,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "names",
         nargs="+",
-        choices=["all", "quick", *EXPERIMENTS],
+        choices=["all", "quick", *EXPERIMENTS, "publish"],
         metavar="NAME",
-        help=", ".join(["all", "quick", *EXPERIMENTS]),
+        help=", ".join([*EXPERIMENTS]) + "; all of them, or a quick part of all; publish writes the tables measured so "
+        "far into the pages that show them",
     )
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the real data sets (default: %(default)s)")
     parser.add_argument("--out", type=Path, default=Path("results"), help="folder for results (default: %(default)s)")
@@ -78,11 +81,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = Options(given.data, given.out, quick="quick" in given.names)
     if options.quick:
         options = replace(options, out=given.out / "quick")
-    names = list(EXPERIMENTS) if {"all", "quick"} & set(given.names) else given.names
+    names = [name for name in given.names if name != "publish"]
+    if {"all", "quick"} & set(names):
+        names = list(EXPERIMENTS)
     options.out.mkdir(parents=True, exist_ok=True)
     start = time.perf_counter()
     for name in names:
         EXPERIMENTS[name](options)
+    if "publish" in given.names and not options.quick:
+        publish(options.out, list(EXPERIMENTS))
     print(f"{len(names)} experiments in {(time.perf_counter() - start) / 60:.1f} minutes, results in {options.out}")
     return 0
 

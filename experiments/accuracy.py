@@ -234,17 +234,17 @@ def measure(options: Options, names: Sequence[str] = ()) -> None:
     print(text)
 
 
-def write_between_marks(readme: Path, text: str) -> None:
-    """Replace what stands between the accuracy comments of a Markdown file.
+def write_between_marks(readme: Path, text: str, marks: tuple[str, str] = MARKS) -> None:
+    """Replace what stands between two comments of a Markdown file.
 
     Raises:
         InputError: the file does not hold both comments.
     """
     old = readme.read_text(encoding="utf-8")
-    before, start, rest = old.partition(MARKS[0])
-    _, end, after = rest.partition(MARKS[1])
+    before, start, rest = old.partition(marks[0])
+    _, end, after = rest.partition(marks[1])
     if not start or not end:
-        raise InputError(f"{readme}: expected the comments {' and '.join(MARKS)}, between which the table goes")
+        raise InputError(f"{readme}: expected the comments {' and '.join(marks)}, between which the table goes")
     with written_beside(readme) as part:
         part.write_text(f"{before}{start}\n{text}{end}{after}", encoding="utf-8")
 

@@ -9,13 +9,14 @@ from experiments.study import VARIANTS, Experiment, Group, Options, group, read_
 from experiments.synthetic import MIXED, SPHERES
 
 DIGITS = 2
+PUBLISHED = "Con-NRSfM as published"
 SOURCES: tuple[Experiment, ...] = (SPHERES, MIXED, TSHIRT, FLAG, KINECT_PAPER)
 
 
 def summarise(options: Options) -> None:
     """Write summary.md from what was measured so far; data sets without results are left out."""
     lines = ["### 3D error in percent, mean over seeds", ""]
-    lines += [_line(["", *VARIANTS]), _line(["---"] * (1 + len(VARIANTS)))]
+    lines += [_line(["", *VARIANTS, PUBLISHED]), _line(["---"] * (2 + len(VARIANTS)))]
     remarks = []
     for experiment in SOURCES:
         rows = read_rows(options.out / f"{experiment.name}.csv")
@@ -25,7 +26,8 @@ def summarise(options: Options) -> None:
             conditions.setdefault(each.keys.get("condition", ""), {})[each.keys["method"]] = each
         for condition, methods in conditions.items():
             name = f"{experiment.title.split(':')[0]}{', ' * bool(condition)}{condition}"
-            lines.append(_line([name, *_cells(methods)]))
+            published = experiment.published.get((*[condition] * bool(condition), "paper mode"), "").partition(" ")[0]
+            lines.append(_line([name, *_cells(methods), published]))
             best = _best(methods)
             if "default" not in methods:
                 remarks.append(f"{name}: our default mode was not run.")

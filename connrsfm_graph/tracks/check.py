@@ -118,11 +118,12 @@ def _refuse_camera(tracks: Tracks, source: str) -> None:
     """Intrinsics that leave nothing of the image, or no perspective that double precision could show."""
     least, most = _SPREAD if tracks.camera.kappa else (_SPREAD[0] ** 10, _SPREAD[1] ** 10)
     with np.errstate(over="ignore", invalid="ignore"):
-        spread = float(np.nanmedian(np.nanstd(tracks.normalised(), axis=1)))
-    if not least < spread < most:
+        image = tracks.normalised()
+        spread, off = float(np.nanmedian(np.nanstd(image, axis=1))), float(np.nanmedian(np.abs(image)))
+    if not least < spread < most or not off < most:
         raise InputError(
-            f"{source}: the points spread over {spread:.2g} times the focal length, expected between {least:g} and "
-            f"{most:g}; do the intrinsics belong to these pixels?"
+            f"{source}: the points spread over {spread:.2g} focal lengths, {off:.2g} off the camera's axis, expected "
+            f"between {least:g} and {most:g}; do the intrinsics belong to these pixels?"
         )
 
 

@@ -62,8 +62,13 @@ def test_a_wild_observation_is_left_out(where: float) -> None:
 
 @pytest.mark.parametrize("factor", [1e300, 1e9, 1e-8])
 def test_intrinsics_of_another_world_are_refused(factor: float) -> None:
-    with pytest.raises(InputError, match=r"times the focal length.*do the intrinsics belong to these pixels"):
+    with pytest.raises(InputError, match=r"focal lengths.*do the intrinsics belong to these pixels"):
         check_reconstructable(Tracks.checked(views(), K * [[factor], [factor], [1.0]]))
+
+
+def test_pixels_far_off_the_axis_are_refused() -> None:
+    with pytest.raises(InputError, match=r"2e\+05 off the camera's axis.*do the intrinsics belong to these pixels"):
+        check(views() + 1e8)
 
 
 def test_images_are_called_by_their_names() -> None:
