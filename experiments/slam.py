@@ -20,7 +20,7 @@ one.
 
     python -m experiments.slam --out DIR
 
-prints both tables and writes slam.csv and slam_real.csv.
+prints both tables and writes slam.csv, slam_real.csv and slam.md.
 """
 
 from __future__ import annotations
@@ -242,12 +242,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     case = simulated_case(options.frames, options.points, options.background, options.seed)
     rows = compare(case, options.lag)
     save(options.out / "slam.csv", rows)
-    print(f"simulated reconstruction, {options.frames} views x {options.points} points\n{table(rows)}")
+    text = f"simulated reconstruction, {options.frames} views x {options.points} points\n{table(rows)}"
+    print(text)
     if options.real_frames:
         case = real_case(options.real_frames, options.real_points, options.background, options.seed)
         rows = [*compare(case, options.lag), live(case, options.together)]
         save(options.out / "slam_real.csv", rows)
-        print(f"real reconstruction, {options.real_frames} views x {options.real_points} points\n{table(rows)}")
+        real = f"real reconstruction, {options.real_frames} views x {options.real_points} points\n{table(rows)}"
+        print(f"\n{real}")
+        text += f"\n\n{real}"
+    with written_beside(options.out / "slam.md") as part:
+        part.write_text(f"# Deformable fusion with camera poses\n\n```\n{text}\n```\n", encoding="utf-8")
     return 0
 
 

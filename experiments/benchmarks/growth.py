@@ -4,7 +4,8 @@ A simulated reconstruction of a waving sheet, all points in view, with odometry 
 
     python -m experiments.benchmarks.growth --out DIR
 
-prints the figures and writes growth.csv with the milliseconds of every view. Times are those of the processor.
+prints the figures and writes growth.md and growth.csv with the milliseconds of every view. Times are those of the
+processor.
 """
 
 from __future__ import annotations
@@ -74,7 +75,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     fusion, milliseconds = grow(case)
     options.out.mkdir(parents=True, exist_ok=True)
     np.savetxt(options.out / "growth.csv", milliseconds, fmt="%.3f", header="milliseconds of each view")
-    print(report(case, fusion, milliseconds))
+    text = report(case, fusion, milliseconds)
+    print(text)
+    heading = f"# Fusion view by view, {options.frames} views x {options.points} points"
+    (options.out / "growth.md").write_text(f"{heading}\n\n```\n{text}\n```\n", encoding="utf-8")
     return 0
 
 
