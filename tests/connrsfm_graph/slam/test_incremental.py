@@ -58,10 +58,11 @@ def test_view_by_view_ends_within_a_thousandth_of_the_batch():
     assert fused.cost < online < 1.001 * fused.cost
 
 
-def test_relaxation_moves_cameras_and_keeps_shapes():
+@pytest.mark.parametrize("motion", ["position", "velocity"])
+def test_relaxation_moves_cameras_and_keeps_shapes(motion):
     """With the early views held too early the unit is wrong; the relaxation mends most of it."""
     case = posed(n_frames=40, n_points=30, n_background=0, gaps=0.1)
-    fusion = grown(case, lag=5, growth=100.0)
+    fusion = grown(case, lag=5, growth=100.0, map=MapModel(motion=motion))
     before, shapes = fusion.cost(), [shape.copy() for shape in fusion.map.shape]
     batch = fusion.finish()
     wrong = abs(np.mean([fusion.log_scale(view) for view in range(40)]) - batch.log_scale.mean())
