@@ -59,8 +59,8 @@ def check_reconstructable(tracks: Tracks, source: str = "tracks") -> tuple[Track
     if len(empty):
         raise InputError(f"{source}: {_frames(tracks, empty)} shows no point at all; leave it out")
     rare = _rarely_seen(tracks, source)
-    tracks, coincident = _hide_coincident(tracks)
     tracks, wild = _hide_wild(tracks)
+    tracks, coincident = _hide_coincident(tracks)
     counts = tracks.visible.sum(axis=1)
     poor = np.flatnonzero(counts < MIN_POINTS)
     if len(poor):
@@ -102,7 +102,8 @@ def _hide_wild(tracks: Tracks) -> tuple[Tracks, list[str]]:
     visible = tracks.visible.copy()
     for seen, points in zip(visible, tracks.pixels, strict=True):
         distance = np.hypot(*(points - np.median(points[seen], axis=0)).T)
-        seen &= ~(distance > _WILD * np.median(distance[seen]))
+        typical = np.median(distance[seen])
+        seen &= ~(distance > _WILD * typical) | (typical == 0.0)
     wild = np.argwhere(tracks.visible & ~visible)
     if not len(wild):
         return tracks, []

@@ -46,7 +46,7 @@ def test_real_tracks_pass(realdata, name: str) -> None:
     assert warnings == ()
 
 
-@pytest.mark.parametrize("where", [1e12, -1e300])
+@pytest.mark.parametrize("where", [1e12, -1e307])
 def test_a_wild_observation_is_left_out(where: float) -> None:
     """It would make all others a point, and the image a line."""
     pixels = views()
