@@ -58,6 +58,7 @@ def answer(
             log_factor=np.zeros((F, P)),
             interpolated=np.zeros((F, P), bool),
             outlier=np.zeros((F, P), bool),
+            camera=tracks.camera,
         )
     record = RunRecord(
         source="",

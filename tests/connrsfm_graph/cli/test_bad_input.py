@@ -121,6 +121,7 @@ def test_output_that_is_a_file(connrsfm: Run, tracks_file: Path) -> None:
         (("--config", "absent.toml"), ("absent.toml: no such file",)),
         (("--intrinsics", "500,500"), ("expected fx,fy,cx,cy",)),
         (("--mode", "best"), ("invalid choice: 'best'",)),
+        (("--camera", "fisheye"), ("invalid choice: 'fisheye'",)),
         (("--seed", "x"), ("invalid int value",)),
     ],
 )
@@ -149,6 +150,8 @@ def test_evaluate_without_or_with_other_truth(connrsfm: Run, tracks_file: Path, 
     refused(connrsfm("evaluate", tmp_path, "--truth", tracks_file), "holds no result.npz")
     refused(connrsfm("report", tmp_path), "holds no result.npz")
     refused(connrsfm("report", tracks_file), "is a file, expected the folder")
+    (out / "run.json").write_text('{"source": 1, "method": "mine", "seed": 0}')
+    refused(connrsfm("report", out), "run.json: 'source' is not a text")
 
 
 def test_track_refuses(connrsfm: Run, tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ import pytest
 from connrsfm_graph.reconstruction import Reconstruction, RunRecord
 from connrsfm_graph.synthetic.rendered import RenderConfig, render_sequence
 from connrsfm_graph.tracks import load_tracks
+from factors.surface import ORTHOGRAPHIC, PERSPECTIVE
 
 from .conftest import Ended, arrays
 
@@ -50,6 +51,14 @@ def test_reconstruct_writes_everything_and_says_where(connrsfm: Run, tracks_file
             "solve": {"iterations": 3},
         }
     )
+
+
+def test_the_camera_is_the_one_asked_for(connrsfm: Run, tracks_file: Path, tmp_path: Path) -> None:
+    for camera in (PERSPECTIVE, ORTHOGRAPHIC):
+        out = tmp_path / camera.name
+        assert connrsfm("reconstruct", tracks_file, "--out", out, "--camera", camera.name, "--no-report").status == 0
+        assert Reconstruction.load(out).camera is camera
+        assert "frame" in connrsfm("evaluate", out, "--truth", tracks_file).out
 
 
 def test_same_run_gives_the_same_result_file(connrsfm: Run, tracks_file: Path, tmp_path: Path) -> None:
