@@ -199,7 +199,8 @@ def _summary(frames: list[_Frame]) -> dict[str, Any]:
 def _project(points: np.ndarray, what: str, frame: int) -> np.ndarray:
     if (points[:, 2] <= 0).any():
         raise InputError(
-            f"a point of the {what} lies behind the camera in frame {frame}; give image coordinates to evaluate over"
+            f"a point of the {what} lies behind the camera in frame {frame}; expected depths above 0, or an "
+            "orthographic camera"
         )
     return points[:, :2] / points[:, 2:]
 

@@ -10,6 +10,9 @@ import numpy as np
 from connrsfm_graph.errors import InputError
 from factors.surface import CAMERAS, PERSPECTIVE, Camera
 
+_LARGEST = 1e100
+"""Squares of larger coordinates are no numbers."""
+
 
 @dataclass(frozen=True)
 class Tracks:
@@ -162,6 +165,8 @@ def _truth(array: np.ndarray | None, shape: tuple[int, ...], what: str) -> np.nd
     array = _numeric(array, what)
     if array.shape != shape:
         raise InputError(f"{what} has shape {array.shape}, expected {shape}")
+    if (largest := np.abs(np.where(np.isfinite(array), array, 0.0)).max()) > _LARGEST:
+        raise InputError(f"{what} holds numbers as large as {largest:.3g}, expected coordinates in some unit of length")
     return array
 
 

@@ -147,6 +147,7 @@ def test_npz_fields_are_named(tmp_path: Path) -> None:
         ({**good, "K": K * np.nan}, "'K' holds NaN"),
         ({**good, "visible": np.ones((5, 3), bool)}, "'visible' has shape (5, 3), expected (3, 5)"),
         ({**good, "points": np.ones((3, 4, 3))}, "'points' has shape (3, 4, 3)"),
+        ({**good, "points": np.full((3, 5, 3), 1e200)}, "'points' holds numbers as large as 1e+200"),
         ({**good, "image_names": np.array(["a"])}, "'image_names' has 1 entries"),
         ({**good, "image_names": np.array([1, 2, 3])}, "'image_names' is not a list of names"),
         ({**good, "tracks": np.full((3, 5, 2), np.inf), "visible": np.ones((3, 5), bool)}, "frame 0, point 0"),
