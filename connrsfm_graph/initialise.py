@@ -11,6 +11,7 @@ from typing import Literal
 
 import numpy as np
 
+from connrsfm_graph.errors import InputError
 from connrsfm_graph.orthographic import initialise_orthographic
 from connrsfm_graph.problem import Problem, State, flat_state, planar_state
 from connrsfm_graph.solvers.interface import Backend, Levenberg, PairModel
@@ -34,7 +35,12 @@ def initialise(
         start: `pre-step` solves the isometric pair factors of every point from zeros; the others set all first-order
             terms to 0, to 1, or to random numbers between -1 and 1.
         seed: of the random numbers.
+
+    Raises:
+        InputError: zeros with an orthographic camera, whose metrics do not change there to first order.
     """
+    if start == "zeros" and not problem.camera.kappa:
+        raise InputError("start is 'zeros', from which orthographic cameras lead nowhere; expected another one")
     if start == "pre-step" and not problem.camera.kappa:
         return initialise_orthographic(problem, backend, settings)
     if start == "pre-step":

@@ -68,8 +68,9 @@ def _rows(path: Path) -> tuple[np.ndarray, np.ndarray, list[int]]:
                     ids.append((_index(f), _index(p)))
                     pixels.append((_pixel(x), _pixel(y)))
                 except (ValueError, IndexError):
+                    shown = " ".join(",".join(row).split())[:60]
                     raise InputError(
-                        f"{path}: line {reader.line_num} is '{','.join(row)[:60]}', expected two whole numbers and "
+                        f"{path}: line {reader.line_num} is '{shown}', expected two whole numbers and "
                         "two pixel coordinates"
                     ) from None
                 lines.append(reader.line_num)

@@ -177,6 +177,11 @@ def test_files_keep_the_camera(result: Reconstruction, smooth: Tracks, tmp_path:
     assert Reconstruction.load(tmp_path / "result.npz").camera is ORTHOGRAPHIC
 
 
+def test_no_slope_anywhere_is_no_start(bending: Scene) -> None:
+    with pytest.raises(InputError, match="start is 'zeros', from which orthographic cameras lead nowhere"):
+        initialise(exact(bending), BatchedBackend(), start="zeros")
+
+
 def test_baselines_refuse_the_camera(smooth: Tracks) -> None:
     with pytest.raises(InputError, match="'infp' is for perspective cameras, the tracks are orthographic"):
         METHODS["infp"](smooth, Config(), Progress())
