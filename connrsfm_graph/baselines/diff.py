@@ -15,7 +15,7 @@ quadratic in r; the sum of its squares over all pairs is minimised over |r| <= 1
 
 Simplified: a search over polar coordinates instead of resultants, and the slopes of the other images by Christoffel
 transfer, since (ii) divides by q_b . n_b, which vanishes. Published 3D error on the T-shirt: 4.02 %; 4.36 % from the
-authors' public code.
+authors' public code; 4.52 % here.
 """
 
 from __future__ import annotations
