@@ -51,7 +51,7 @@ def test_the_command_line_knows_every_experiment(capsys: pytest.CaptureFixture[s
     with pytest.raises(SystemExit) as stop:
         main(["no_such_experiment"])
     assert stop.value.code == 2
-    others = {"theorem", "cloth", "dense", "accuracy", "summary"}
+    others = {"theorem", "cloth", "dense", "accuracy", "slam", "summary"}
     assert {experiment.name for experiment in TABLES} | others == set(EXPERIMENTS)
 
 
