@@ -37,6 +37,7 @@ import numpy as np
 from connrsfm_graph.files import written_beside
 from connrsfm_graph.metrics.alignment import align_similarity
 from connrsfm_graph.reconstruct import reconstruct
+from connrsfm_graph.reconstruction import Reconstruction
 from connrsfm_graph.slam import (
     Fused,
     FusionNoise,
@@ -102,14 +103,14 @@ def real_case(frames: int, points: int, background: int, seed: int) -> Case:
     scene = passing_camera(frames, points, background, seed=seed)
     rng = np.random.default_rng(seed + 1)
     image = scene.image + IMAGE_SIGMA * rng.normal(size=scene.image.shape)
-    sightings = reconstructed(scene, image, frames)
-    return _case(scene, image, sightings, estimate_noise(sightings), rng, seed)
+    made = reconstructed(scene, image, frames)
+    return _case(scene, image, Sightings.of(made), estimate_noise(made), rng, seed)
 
 
-def reconstructed(scene: PassingScene, image: np.ndarray, frames: int) -> Sightings:
+def reconstructed(scene: PassingScene, image: np.ndarray, frames: int) -> Reconstruction:
     """The first frames, reconstructed without poses."""
     pixels = image[:frames] * INTRINSICS[0, 0] + INTRINSICS[:2, 2]
-    return Sightings.of(reconstruct(Tracks.checked(pixels, INTRINSICS, scene.visible[:frames]))[0])
+    return reconstruct(Tracks.checked(pixels, INTRINSICS, scene.visible[:frames]))[0]
 
 
 def _case(
@@ -157,7 +158,7 @@ def incremental(case: Case, lag: int) -> Row:
 
 def live(case: Case, together: int) -> Row:
     """The first views reconstructed together, the others from their tracks; time per view of these."""
-    first = reconstructed(case.scene, case.image, together)
+    first = Sightings.of(reconstructed(case.scene, case.image, together))
     started = time.process_time()
     found = fuse_live(first, case.image, case.scene.visible, steps=case.steps, pose=case.scene.poses[0])
     seconds = (time.process_time() - started) / (len(case.image) - together)

@@ -107,16 +107,17 @@ def _all_together(
     """All views are reconstructed, then fused."""
     import numpy as np
 
-    from connrsfm_graph.slam import Sightings, pose_problem, solve_problem
+    from connrsfm_graph.slam import Sightings, estimate_noise, pose_problem, solve_problem
     from connrsfm_graph.tracks import load_tracks
 
     background = None
     if arguments.background is not None:
         tracked = load_tracks(arguments.background, arguments.intrinsics)
         background = np.nan_to_num(tracked.normalised()), tracked.visible
-    sightings = Sightings.of(_reconstruction(arguments, tracks, progress))
+    reconstruction = _reconstruction(arguments, tracks, progress)
     with progress.stage("noise levels"):
-        problem = pose_problem(sightings, config, None, steps, background, first)
+        noise = estimate_noise(reconstruction)
+        problem = pose_problem(Sightings.of(reconstruction), config, noise, steps, background, first)
     with progress.stage("fusion"):
         return problem, solve_problem(problem, config.fusion, progress.update)
 

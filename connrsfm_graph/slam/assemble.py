@@ -85,7 +85,7 @@ def add_reconstruction(
         InputError: a pose is missing, or a variable is in `values` already.
     """
     sightings = reconstruction if isinstance(reconstruction, Sightings) else Sightings.of(reconstruction)
-    noise = noise or estimate_noise(sightings)
+    noise = noise or estimate_noise(reconstruction)
     model = model or MapModel()
     views = np.flatnonzero(sightings.seen.any(axis=1))
     new_graph, new_values = gtsam.NonlinearFactorGraph(), gtsam.Values()

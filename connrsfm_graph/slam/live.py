@@ -15,10 +15,9 @@ from connrsfm_graph.errors import InputError
 from connrsfm_graph.slam.cameras import start_cameras
 from connrsfm_graph.slam.incremental import IncrementalConfig, IncrementalFusion
 from connrsfm_graph.slam.keyframes import KeyframeConfig, Keyframes
-from connrsfm_graph.slam.noise import FusionNoise, estimate_noise
+from connrsfm_graph.slam.noise import FusionNoise, estimate_noise, image_noise
 from connrsfm_graph.slam.run import SlamConfig
 from connrsfm_graph.slam.sightings import Sightings
-from connrsfm_graph.warps.noise import estimate_pixel_noise
 from factors.keys import VIEW_SCALE, key
 
 
@@ -118,18 +117,16 @@ def fuse_live(
     config = config or SlamConfig()
     F, K = len(image), first.n_views
     sigmas = None if steps is None else config.odometry_sigmas(steps)
-    neighbours = np.column_stack([np.arange(K - 1), np.arange(1, K)])
-    image_sigma = estimate_pixel_noise(image[:K], visible[:K], neighbours)
-    keyframes = KeyframeConfig() if not image_sigma > 0 else KeyframeConfig(image_sigma=image_sigma)
+    sigma = image_noise(image[:K], visible[:K])
     incremental = IncrementalConfig(map=config.fusion.map)
     live = LiveFusion(
         first,
-        estimate_noise(first),
+        estimate_noise(first, sigma),
         None if steps is None else steps[: K - 1],
         None if sigmas is None else sigmas[: K - 1],
         pose,
         incremental,
-        keyframes,
+        KeyframeConfig(image_sigma=max(sigma, 1e-6)),
     )
     for view in range(K, F):
         (points,) = np.nonzero(visible[view])

@@ -8,11 +8,14 @@ import numpy as np
 
 from connrsfm_graph.errors import InputError
 from connrsfm_graph.metrics.alignment import align_similarity
+from connrsfm_graph.reconstruction import Reconstruction
 from connrsfm_graph.slam.sightings import Sightings
 from connrsfm_graph.warps.noise import estimate_pixel_noise
 
 _FEWEST = 4
 """Shared points from which two views can be fitted onto each other with something left to see the noise by."""
+_USUAL = 1e-3
+"""Noise of image points where the views are too few or too sparse to show it."""
 _MAD = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
 
@@ -37,7 +40,7 @@ class FusionNoise:
                 raise InputError(f"fusion: {name} noise is {getattr(self, name)}, expected a positive number")
 
 
-def estimate_noise(sightings: Sightings, image_sigma: float | None = None) -> FusionNoise:
+def estimate_noise(reconstruction: Reconstruction | Sightings, image_sigma: float | None = None) -> FusionNoise:
     """Noise levels from the fit of neighbouring views onto each other, without any truth.
 
     Each view is fitted to the next by a similarity. What remains across the sight rays is motion; what remains along
@@ -46,12 +49,18 @@ def estimate_noise(sightings: Sightings, image_sigma: float | None = None) -> Fu
     similarities are the drift of the unit. Medians over all points, so that a minority of wrong tracks does not matter.
 
     Args:
-        sightings: two views or more.
-        image_sigma: noise of the image points, normalised coordinates; estimated from image warps where None.
+        reconstruction: two views or more.
+        image_sigma: noise of the image points, normalised coordinates; where None it is estimated from image warps of
+            the tracks, or of the sight rays where there are no tracks: those of a refined reconstruction are corrected
+            and look better than they are.
 
     Raises:
         InputError: no two neighbouring views share enough points.
     """
+    sightings = reconstruction if isinstance(reconstruction, Sightings) else Sightings.of(reconstruction)
+    if image_sigma is None:
+        image = reconstruction.image if isinstance(reconstruction, Sightings) else _tracked(reconstruction)
+        image_sigma = image_noise(image, sightings.seen)
     points = sightings.points()
     across, along, scales, depths = [], [], [], []
     for a in range(sightings.n_views - 1):
@@ -73,10 +82,6 @@ def estimate_noise(sightings: Sightings, image_sigma: float | None = None) -> Fu
     motion = float(np.median(np.concatenate(across))) / 1.1774
     distance = float(np.median(np.concatenate(depths)))
     radial_std = _MAD * float(np.median(np.abs(np.concatenate(along))))
-    if image_sigma is None:
-        neighbours = np.column_stack([np.arange(sightings.n_views - 1), np.arange(1, sightings.n_views)])
-        image_sigma = estimate_pixel_noise(sightings.image, sightings.seen, neighbours)
-    image_sigma = image_sigma if np.isfinite(image_sigma) else 1e-3
     floor = 0.1 * image_sigma
     stated = sightings.depth_std[sightings.seen]
     if np.isfinite(stated).mean() > 0.5:
@@ -90,3 +95,22 @@ def estimate_noise(sightings: Sightings, image_sigma: float | None = None) -> Fu
         motion=max(motion, floor * distance),
         scale=max(_MAD * float(np.median(np.abs(scales))), 1e-3),
     )
+
+
+def image_noise(image: np.ndarray, seen: np.ndarray) -> float:
+    """Standard deviation of a coordinate of image points (F, P, 2) by the warps between neighbouring views.
+
+    Args:
+        image: normalised coordinates, any value where not `seen`.
+        seen: (F, P) bool.
+    """
+    neighbours = np.column_stack([np.arange(len(seen) - 1), np.arange(1, len(seen))])
+    sigma = estimate_pixel_noise(np.where(seen[..., None], image, 0.0), seen, neighbours)
+    return sigma if np.isfinite(sigma) else _USUAL
+
+
+def _tracked(reconstruction: Reconstruction) -> np.ndarray:
+    """(F, P, 2) tracks in normalised coordinates."""
+    pixels = np.nan_to_num(reconstruction.pixels)
+    homogeneous = np.concatenate([pixels, np.ones_like(pixels[..., :1])], axis=-1)
+    return np.asarray(np.linalg.solve(reconstruction.K[:, None], homogeneous[..., None])[..., :2, 0])
