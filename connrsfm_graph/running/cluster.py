@@ -66,7 +66,8 @@ class Cluster:
         known = self._client.submit(_unpacked, pickle.dumps(guide), pure=False)
         blocks = iter(blocks)
         threads = sum(self._client.nthreads().values())
-        under_way: Any = as_completed([self._submitted(known, block) for block in islice(blocks, _AHEAD * threads)])
+        first = [self._submitted(known, block) for block in islice(blocks, _AHEAD * threads)]
+        under_way: Any = as_completed(first, loop=self._client.loop)
         for future in under_way:
             try:
                 finished = future.result()

@@ -1,13 +1,16 @@
-"""One damped Gauss-Newton iteration of the differential solve: batched executor against GTSAM and scipy.
+"""One damped Gauss-Newton iteration of the differential solve: batched executor against GTSAM, scipy and torch.
 
     python -m experiments.benchmarks.iteration [--frames 159 --points 300 --repeats 5 --out DIR]
 
 All solve the same linear systems of the same pair factors on a spanning tree of a bending sheet:
 
 - `batched`: the executor's whole step (linearise, eliminate, solve, evaluate);
-- `gtsam`: linearise and eliminate one graph of all pair factors, driven from Python;
-- `scipy`: `least_squares(method="trf")` point by point with the analytic Jacobian, limited to one iteration; it is
-  timed on a sample of the points and scaled up.
+- `GTSAM`: linearise and eliminate one graph of all pair factors, driven from Python;
+- GTSAM's own Levenberg-Marquardt, one iteration point by point;
+- scipy's `least_squares(method="trf")` point by point with the analytic Jacobian, limited to one iteration;
+- `torch`: the step vectorised over all points (see `torch_step`), on the GPU too where there is one.
+
+What goes point by point is timed on a sample of the points and scaled up.
 
 The figure to quote is the ratio of medians. Steps are compared, so that all solve the same problem.
 """
@@ -15,15 +18,13 @@ The figure to quote is the ratio of medians. Steps are compared, so that all sol
 from __future__ import annotations
 
 import argparse
-import csv
-import platform
 import statistics
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import gtsam
-import numba
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.sparse import csr_array
@@ -32,13 +33,18 @@ from connrsfm_graph.problem import Problem, State, make_problem, planar_state
 from connrsfm_graph.solvers.batched import BatchedBackend
 from connrsfm_graph.solvers.gtsam_backend import damped, full_graph, point_graph
 from connrsfm_graph.synthetic import isometric_bending
+from experiments.benchmarks.table import Row, Table, cores
 from factors import keys
+from factors.conformal_pair import SLOTS
 from factors.noise import PairNoise
 
 ACTIVE = {"joint": ("d", "c", "s"), "step 1": ("c",), "step 2": ("d",)}
 NOISE = PairNoise(1.0, 10.0, 30.0)
 DAMPING = 1e-3
-SCIPY_POINTS = 3
+SAMPLE = 3
+"""Points of which those that go point by point are timed."""
+TORCH_REPEATS = 2
+SAME_STEP = 1e-6
 
 
 def bending_problem(frames: int, points: int) -> tuple[Problem, State]:
@@ -102,55 +108,97 @@ def largest_difference(step: gtsam.VectorValues, values: gtsam.Values, before: S
     return worst
 
 
-def main(arguments: list[str] | None = None) -> list[dict[str, object]]:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--frames", type=int, default=159)
-    parser.add_argument("--points", type=int, default=300)
-    parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--out", type=Path, help="folder for iteration.csv")
-    options = parser.parse_args(arguments)
-    problem, state = bending_problem(options.frames, options.points)
+def built_in_iteration(problem: Problem, state: State, point: int, active: tuple[str, ...]) -> None:
+    """One iteration of GTSAM's own Levenberg-Marquardt on one point."""
+    graph, values = point_graph(problem, state, point, active, NOISE)
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setlambdaInitial(DAMPING)
+    gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).iterate()
+
+
+def torch_steps(problem: Problem, state: State, active: tuple[str, ...], expected: State) -> dict[str, float]:
+    """Seconds of the vectorised torch version, by device; nothing where torch is absent.
+
+    Raises:
+        RuntimeError: its step is another one.
+    """
+    try:
+        import torch
+    except ImportError:
+        return {}
+    from experiments.benchmarks.torch_step import make_step
+
+    columns = [column for letter in "dc" if letter in active for column in range(*SLOTS[letter][0])]
+    seconds = {}
+    for name, device in (("torch", "cpu"), ("torch, GPU", "cuda")):
+        if device == "cuda" and not torch.cuda.is_available():
+            continue
+        torch.set_num_threads(cores())
+        step = make_step(problem, state, active, NOISE, DAMPING, device)
+        gap = np.abs(step().numpy() - (expected.frame - state.frame)[..., columns]).max()
+        if not gap < SAME_STEP:
+            raise RuntimeError(f"the step of {name} differs by {gap:.1e}")
+        seconds[name] = timed(step, TORCH_REPEATS)
+    return seconds
+
+
+def measure_iteration(out: Path, frames: int = 159, points: int = 300, repeats: int = 5) -> None:
+    """`iteration.csv` and `.md`."""
+    table = Table(out, "iteration", ("iteration", "solver"))
+    if all(any(row["iteration"] == name for row in table.rows) for name in ACTIVE):
+        return
+    problem, state = bending_problem(frames, points)
     pairs = int((problem.weight > 0).sum())
     backend = BatchedBackend()
-    print(f"{platform.machine()}, {numba.get_num_threads()} threads, Python {platform.python_version()}")
-    print(f"{options.frames} images x {options.points} points, {pairs} point-edge pairs")
-    rows: list[dict[str, object]] = []
     for name, active in ACTIVE.items():
         after = backend.step(problem, state, active, NOISE, damping=DAMPING)
         graph, values = full_graph(problem, state, active, NOISE)
         ordering = gtsam.Ordering.ColamdNonlinearFactorGraph(graph)
-        step = gtsam_step(graph, values, ordering)
+        gap = largest_difference(gtsam_step(graph, values, ordering), values, state, after)
+        if not gap < SAME_STEP:
+            raise RuntimeError(f"the steps of GTSAM and of the executor differ by {gap:.1e}")
+
+        def per_point(work: Callable[[Problem, State, int, tuple[str, ...]], None], active: tuple[str, ...]) -> float:
+            sample = range(min(SAMPLE, points))
+            return statistics.median(timed(partial(work, problem, state, i, active), 1) for i in sample) * points
+
         seconds = {
-            "batched": timed(lambda a=active: backend.step(problem, state, a, NOISE, damping=DAMPING), options.repeats),
-            "gtsam": timed(lambda g=graph, v=values, o=ordering: gtsam_step(g, v, o), max(options.repeats // 2, 1)),
+            "batched": timed(partial(backend.step, problem, state, active, NOISE, damping=DAMPING), repeats),
+            "GTSAM": timed(partial(gtsam_step, graph, values, ordering), max(repeats // 2, 1)),
+            "GTSAM's optimiser per point": per_point(built_in_iteration, active),
+            "scipy TRF per point": per_point(scipy_iteration, active),
+            **torch_steps(problem, state, active, after),
         }
-        sample = range(min(SCIPY_POINTS, options.points))
-        each = [timed(lambda i=i, a=active: scipy_iteration(problem, state, i, a), 1) for i in sample]
-        seconds["scipy"] = statistics.median(each) * options.points
-        rows += [
-            {
-                "iteration": name,
-                "solver": solver,
+        for solver, value in seconds.items():
+            keys: Row = {"iteration": name, "solver": solver}
+            figures = {
+                "images": frames,
+                "points": points,
                 "seconds": round(value, 5),
                 "microseconds per pair": round(1e6 * value / pairs, 2),
                 "times batched": round(value / seconds["batched"], 1),
             }
-            for solver, value in seconds.items()
-        ]
-        print(f"{name}: largest difference of the steps {largest_difference(step, values, state, after):.1e}")
-        for row in rows[-len(seconds) :]:
-            print(
-                "  {solver:8s} {seconds:10.4f} s  {microseconds per pair:9.2f} us/pair  {times batched:8.1f} x".format(
-                    **row
-                )
-            )
-    if options.out is not None:
-        options.out.mkdir(parents=True, exist_ok=True)
-        with (options.out / "iteration.csv").open("w", newline="") as file:
-            writer = csv.DictWriter(file, rows[0])
-            writer.writeheader()
-            writer.writerows(rows)
-    return rows
+            table.measure(keys, partial(dict, figures))
+        table.write(
+            {
+                "iteration": lambda row: str(row["iteration"]),
+                "solver": lambda row: str(row["solver"]),
+                "s": lambda row: f"{float(row['seconds']):.4g}",
+                "µs per pair": lambda row: str(row["microseconds per pair"]),
+                "times batched": lambda row: str(row["times batched"]),
+            }
+        )
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--frames", type=int, default=159)
+    parser.add_argument("--points", type=int, default=300)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--out", type=Path, default=Path("results/benchmarks"), help="folder for iteration.csv")
+    given = parser.parse_args(arguments)
+    measure_iteration(given.out, given.frames, given.points, given.repeats)
+    print((given.out / "iteration.md").read_text(encoding="utf-8"))
 
 
 if __name__ == "__main__":
