@@ -53,7 +53,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--live",
         type=int,
         metavar="N",
-        help="reconstruct the first N views together and take in the others one by one (default: all together)",
+        help="reconstruct the first N views together and take in the others one by one; N views must show the surface "
+        "from sides some tens of degrees apart (default: all together)",
     )
     parser.add_argument("--intrinsics", metavar="K", help="camera of the tracks, instead of the file's own")
     add_configuration(parser)

@@ -38,7 +38,6 @@ class KeyframeConfig:
     """The oldest keyframe is forgotten beyond this many."""
     warps: WarpConfig = field(default_factory=lambda: WarpConfig(model="gaussian_process", covariance=False))
     """Image warps between a new view and its keyframes."""
-
     image_sigma: float = 1e-3
     """Standard deviation of a coordinate of the image points, normalised coordinates."""
     length_sigma: float = 0.01
@@ -47,6 +46,9 @@ class KeyframeConfig:
     def __post_init__(self) -> None:
         if self.edges < 1 or self.most < self.edges:
             raise InputError(f"keyframes: edges {self.edges} and most {self.most}, expected 1 <= edges <= most")
+        for name in ("image_sigma", "length_sigma"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"keyframes: {name} is {getattr(self, name)}, expected a positive number")
 
 
 class Keyframes:

@@ -1,7 +1,8 @@
 """Tracks in, poses and a deforming map out, view by view.
 
-The first views are reconstructed together. Every later one gets its surface from keyframes (`keyframes`, `new_view`),
-is fused with all before (`incremental`), and may become a keyframe itself.
+The first views are reconstructed together; what they get wrong no later one mends, so they must show the surface from
+sides some tens of degrees apart. Every later one gets its surface from keyframes (`keyframes`, `new_view`), is fused
+with all before (`incremental`), and may become a keyframe itself.
 """
 
 from __future__ import annotations
