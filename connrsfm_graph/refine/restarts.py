@@ -30,7 +30,8 @@ _STRIP = 0.1
 _SCREENING = 1
 """Iterations after which the starts are compared."""
 _TRIED = (12, 4.0)
-"""So many of the cheapest starts are then followed to the end, where they cost at most this many times the shape."""
+"""So many of the cheapest starts are then followed to the end, where they cost at most this many times the shape.
+With conformal factors, which are slow to come, all are."""
 _STEEP = 0.15
 """Change of log depth over the spread of the image points in a tilted start."""
 
@@ -67,6 +68,7 @@ def restart(measurements: Measurements, shape: Shape) -> tuple[Shape, np.ndarray
     )
     number, factor = _TRIED
     tried = (np.argsort(np.argsort(first, axis=0), axis=0) < number) & (first <= factor * least)
+    tried |= shape.log_factor.size > 0
     best, renewed = shape, np.zeros(len(least), dtype=bool)
     for start, chosen in zip(_starts(measurements, shape), tried, strict=True):
         if not chosen.any():
