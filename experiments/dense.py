@@ -2,10 +2,10 @@
 
 Three tables, all mean relative errors of depth:
 
-- `simulated`: held-out surfaces of the training's kind with noise on their sparse normals, and nothing but normals. The
-  spline integrates their slopes, with the bending weight by cross-validation, as the reconstruction does; the network
-  reads their image. Both answer on the same grid; each surface is scaled so that the mean log depths agree. `constant`
-  answers with one depth.
+- `simulated`: held-out surfaces of the training's kind with noise on their sparse normals, in sequences of 16, and
+  nothing but normals. The spline integrates their slopes, with the bending weight by cross-validation over a sequence,
+  as the reconstruction does; the network reads their image. Both answer on the same grid; each surface is scaled so
+  that the mean log depths agree. `constant` answers with one depth.
 - `real`: every second true point of the real data sets, with normals by a spline through them, is densified as by
   `connrsfm densify`, that is with their depths; the error is that at the other points.
 - `ablation`: every encoder trained with and without noise for the same few steps on the same surfaces.
@@ -42,6 +42,8 @@ if TYPE_CHECKING:
 NOISE = (0.0, 0.1, 0.2)
 """Standard deviations of the noise on the components of unit normals."""
 SIZE = 64
+SEQUENCE = 16
+"""Simulated surfaces that are answered together, as are the images of a sequence."""
 FRAME = (640, 480)
 """Pixels of the depth maps of real data, whose cameras are scaled to this width."""
 DATA = ("tshirt", "flag", "kinect_paper")
@@ -71,8 +73,12 @@ def measure(options: Options) -> None:
     for part in (_simulated, _real, _ablation):
         for keys, run in part(options, checkpoint):
             if keys not in done:
-                error, milliseconds = run()
-                figures = {"error_percent": f"{100 * error:.4g}", "milliseconds": f"{milliseconds:.3g}"}
+                errors, milliseconds = run()
+                figures = {
+                    "error_percent": f"{100 * statistics.fmean(errors):.3g}",
+                    "median_percent": f"{100 * statistics.median(errors):.3g}",
+                    "milliseconds": f"{milliseconds:.2g}",
+                }
                 append_row(path, dict(zip(("table", "method", "condition"), keys, strict=True)) | figures)
     text = _markdown(read_rows(path))
     (options.out / "dense.md").write_text(text, encoding="utf-8")
@@ -80,8 +86,10 @@ def measure(options: Options) -> None:
     draw_training(checkpoint, options.out / "dense.png")
 
 
-Runs = Iterator[tuple[tuple[str, str, str], Callable[[], tuple[float, float]]]]
-"""Keys of rows, and what measures their error and milliseconds."""
+Figures = tuple[list[float], float]
+"""Errors (of sequences, images or one for all) and milliseconds per image."""
+Runs = Iterator[tuple[tuple[str, str, str], Callable[[], Figures]]]
+"""Keys of rows, and what measures their figures."""
 
 
 def _simulated(options: Options, checkpoint: Checkpoint) -> Runs:
@@ -90,43 +98,45 @@ def _simulated(options: Options, checkpoint: Checkpoint) -> Runs:
         "spline": integrated,
         "network": lambda batch: predicted(batch, checkpoint),
     }
-    count = 8 if options.quick else 400
+    sequences = 1 if options.quick else 25
     for (name, method), noise in product(methods.items(), NOISE):
-        yield ("simulated", name, f"noise {noise:.0%}"), partial(_held_out, method, count, noise)
+        yield ("simulated", name, f"noise {noise:.0%}"), partial(_held_out, method, sequences, noise)
 
 
-def _held_out(method: Callable[[Batch], np.ndarray], count: int, noise: float) -> tuple[float, float]:
-    """Error and milliseconds of a method on surfaces, one at a time."""
+def _held_out(method: Callable[[Batch], np.ndarray], sequences: int, noise: float) -> Figures:
+    """Error of a method and milliseconds per surface, answered `SEQUENCE` at a time."""
     from connrsfm_graph.dense.train import relative_error
 
-    method(simulate(1, SIZE, (_HELD_OUT, count), (noise, noise)))
     errors, seconds = [], []
-    for number in range(count):
-        batch = simulate(1, SIZE, (_HELD_OUT, number), (noise, noise))
+    for number in range(-1, sequences):  # the first one warms up
+        batch = simulate(SEQUENCE, SIZE, (_HELD_OUT, abs(number)), (noise, noise))
         start = time.perf_counter()
         log_depth = method(batch)
         seconds.append(time.perf_counter() - start)
         errors.append(relative_error(log_depth, batch.log_depth, batch.mask))
-    return statistics.fmean(errors), 1e3 * statistics.median(seconds)
+    return errors[1:], 1e3 * statistics.median(seconds[1:]) / SEQUENCE
 
 
 def integrated(batch: Batch) -> np.ndarray:
-    """Log depth (1, S, S) of one surface from its sparse slopes, as `connrsfm_graph.integrate` does it."""
-    p, g = batch.p[0][batch.observed[0]], slopes(batch.m[0][batch.observed[0]])
-    spline = SurfaceSpline(p, (U, V), g, np.ones(len(p)), p, _CONTROL_POINTS, PERSPECTIVE)
-    bending = choose_bending([spline])
+    """Log depths (B, S, S) from sparse slopes, as `connrsfm_graph.integrate` does it for the images of a sequence."""
+    splines = []
+    for p, m, seen in zip(batch.p, batch.m, batch.observed, strict=True):
+        ones = np.ones(seen.sum())
+        splines.append(SurfaceSpline(p[seen], (U, V), slopes(m[seen]), ones, p[seen], _CONTROL_POINTS, PERSPECTIVE))
+    bending = choose_bending(splines)
     for _ in range(3):
-        spline.reweight(_HUBER * 1.4826 * float(np.median(spline.residual_norms(bending))), bending)
-    return on_grid(spline.grid, spline.control(bending), grid(SIZE), grid(SIZE))[None]
+        spread = 1.4826 * float(np.median(np.concatenate([spline.residual_norms(bending) for spline in splines])))
+        for spline in splines:
+            spline.reweight(_HUBER * spread, bending)
+    return np.stack([on_grid(spline.grid, spline.control(bending), grid(SIZE), grid(SIZE)) for spline in splines])
 
 
 def predicted(batch: Batch, checkpoint: Checkpoint) -> np.ndarray:
-    """Log depth (1, S, S) of one surface by the network, the image of normals included."""
+    """Log depths (B, S, S) by the network, the images of normals included."""
     from connrsfm_graph.dense.field import normal_images
     from connrsfm_graph.dense.network import predict
 
-    seen = batch.observed[0]
-    images = normal_images(batch.p[:, seen], batch.m[:, seen], np.ones((1, seen.sum())), SIZE)
+    images = normal_images(batch.p, batch.m, batch.observed.astype(float), SIZE)
     return predict(checkpoint.network, images, batch.mask)
 
 
@@ -143,7 +153,7 @@ def _real(options: Options, checkpoint: Checkpoint) -> Runs:
             yield ("real", name, data), partial(_left_out, method, path)
 
 
-def _left_out(method: Callable[[list[SparsePoints]], DepthMethod], file: Path) -> tuple[float, float]:
+def _left_out(method: Callable[[list[SparsePoints]], DepthMethod], file: Path) -> Figures:
     """Error at every second true point, and milliseconds per image, of a method that is given the others."""
     tracks = load_tracks(file)
     assert tracks.points is not None, "the real data sets hold true points"
@@ -163,7 +173,7 @@ def _left_out(method: Callable[[list[SparsePoints]], DepthMethod], file: Path) -
         made.depth(number, FRAME)
     seconds = (time.perf_counter() - start) / len(given)
     errors = [np.abs(made.depth_at(n, pixels) / depth - 1.0).mean() for n, (pixels, depth) in enumerate(left)]
-    return float(np.mean(errors)), 1e3 * seconds
+    return [float(error) for error in errors], 1e3 * seconds
 
 
 def _ablation(options: Options, checkpoint: Checkpoint) -> Runs:
@@ -180,7 +190,7 @@ def _ablation(options: Options, checkpoint: Checkpoint) -> Runs:
             yield ("ablation", name, f"noise {tested:.0%}"), partial(_trained, config, file, tested)
 
 
-def _trained(config: TrainConfig, file: Path, noise: float) -> tuple[float, float]:
+def _trained(config: TrainConfig, file: Path, noise: float) -> Figures:
     """Error on held-out surfaces, and milliseconds per surface in batches, of a network trained now or before."""
     from connrsfm_graph.dense.checkpoint import Checkpoint
     from connrsfm_graph.dense.train import held_out_error, train
@@ -188,7 +198,7 @@ def _trained(config: TrainConfig, file: Path, noise: float) -> tuple[float, floa
     network = (Checkpoint.load(file) if file.exists() else train(config, file)).network
     start = time.perf_counter()
     error = held_out_error(network, config, noise)
-    return error, 1e3 * (time.perf_counter() - start) / config.held_out
+    return [error], 1e3 * (time.perf_counter() - start) / config.held_out
 
 
 def _markdown(rows: list[Row]) -> str:
@@ -197,16 +207,18 @@ def _markdown(rows: list[Row]) -> str:
     for table in dict.fromkeys(row["table"] for row in rows):
         own = [row for row in rows if row["table"] == table]
         conditions = list(dict.fromkeys(row["condition"] for row in own))
-        lines += [f"### {table}: error of depth in percent (milliseconds per image)", ""]
+        lines += [f"### {table}: error of depth in percent: mean, median (milliseconds per image)", ""]
         lines += [f"| method | {' | '.join(conditions)} |", f"|---|{'---|' * len(conditions)}"]
         for method in dict.fromkeys(row["method"] for row in own):
             found = {row["condition"]: row for row in own if row["method"] == method}
-            cells = [
-                f"{found[c]['error_percent']} ({found[c]['milliseconds']})" if c in found else "" for c in conditions
-            ]
+            cells = [_cell(found[condition]) if condition in found else "" for condition in conditions]
             lines.append(f"| {method} | {' | '.join(cells)} |")
         lines.append("")
     return "\n".join(lines)
+
+
+def _cell(row: Row) -> str:
+    return f"{row['error_percent']}, {row['median_percent']} ({row['milliseconds']})"
 
 
 def draw_training(checkpoint: Checkpoint, path: Path) -> None:

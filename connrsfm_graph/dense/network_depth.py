@@ -29,6 +29,11 @@ CORRECTION_BENDING = 1e-4
 """Bending weight of the correction. What the network lacks is no noise, and cross-validation would follow it closely
 where there are points and anywhere at all where there are none."""
 
+TOGETHER = 16
+"""Images that the network answers at a time."""
+BORDER = 3.0
+"""Pixels of the network's image along the border of the surface where slopes stand in for the network's answer."""
+
 
 class NetworkDepth:
     """Depth maps by a trained network; predicted for all images, evaluated one at a time."""
@@ -37,7 +42,11 @@ class NetworkDepth:
 
     def __init__(self, checkpoint: Checkpoint, images: Sequence[SparsePoints]) -> None:
         """Predict every image and fit the corrections."""
-        self._shapes = [_Shape.of(checkpoint, points) for points in images]
+        self._shapes = [
+            shape
+            for start in range(0, len(images), TOGETHER)
+            for shape in _shapes(checkpoint, images[start : start + TOGETHER])
+        ]
         self._corrections = [
             log_depth_spline(points.pixels, np.log(points.depth) - shape.at(points.pixels), CORRECTION_POINTS)
             for points, shape in zip(images, self._shapes, strict=True)
@@ -77,20 +86,6 @@ class _Shape:
     spline: RectBivariateSpline
     """By window coordinates, the second one first."""
 
-    @staticmethod
-    def of(checkpoint: Checkpoint, points: SparsePoints) -> _Shape:
-        """Predict the shape of one image's surface."""
-        size = checkpoint.size
-        window = Window.around(points.pixels, points.K)
-        p = window.places(points.pixels)
-        m = window.encode(points.normals, p)
-        mask = surface_region((p + 1.0) * (size / 2) - 0.5, (size, size))
-        images = normal_images(p[None], m[None], np.ones((1, len(p))), size)
-        log_depth = predict(checkpoint.network, images, mask[None])[0]
-        places = grid(size)
-        continued = _continued(log_depth, slopes(images[0]), mask)
-        return _Shape(window, RectBivariateSpline(places, places, continued, bbox=[-1.0, 1.0, -1.0, 1.0]))
-
     def at(self, pixels: np.ndarray) -> np.ndarray:
         """(N,) log depth at pixels (N, 2)."""
         p = self.window.places(pixels)
@@ -102,15 +97,37 @@ class _Shape:
         return self.spline((y - centre[1]) / half[1], (x - centre[0]) / half[0])
 
 
-def _continued(log_depth: np.ndarray, g: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Log depth (S, S) continued off the surface by the slopes g (S, S, 2) of the nearest pixel on it.
+def _shapes(checkpoint: Checkpoint, images: Sequence[SparsePoints]) -> list[_Shape]:
+    """Predict the shapes of some images' surfaces together."""
+    size = checkpoint.size
+    windows = [Window.around(points.pixels, points.K) for points in images]
+    places = [window.places(points.pixels) for window, points in zip(windows, images, strict=True)]
+    masks = np.stack([surface_region((p + 1.0) * (size / 2) - 0.5, (size, size)) for p in places])
+    normals = np.concatenate(
+        [
+            normal_images(p[None], window.encode(points.normals, p)[None], np.ones((1, len(p))), size)
+            for window, points, p in zip(windows, images, places, strict=True)
+        ]
+    )
+    log_depth = predict(checkpoint.network, normals, masks)
+    axis, box = grid(size), [-1.0, 1.0, -1.0, 1.0]
+    return [
+        _Shape(window, RectBivariateSpline(axis, axis, _continued(answer, slopes(image), mask), bbox=box))
+        for window, answer, image, mask in zip(windows, log_depth, normals, masks, strict=True)
+    ]
 
-    Interpolation between pixels needs neighbours beyond the border, where the network's answer means nothing.
+
+def _continued(log_depth: np.ndarray, g: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Log depth (S, S) of the surface's inside, continued over its border and beyond by the slopes g (S, S, 2).
+
+    Interpolation needs neighbours off the surface, where the network's answer means nothing, and at the border itself,
+    in corners above all, the network knows least; the slopes are known there.
     """
-    rows, columns = distance_transform_edt(~mask, return_distances=False, return_indices=True)
+    depth_inside = distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1]
+    inside = depth_inside > min(BORDER, 0.5 * depth_inside.max())
+    rows, columns = distance_transform_edt(~inside, return_distances=False, return_indices=True)
     y, x = np.indices(mask.shape)
-    cell = 2.0 / len(mask)
-    slope = g[rows, columns] * cell
+    slope = 0.5 * (g[rows, columns] + g) * (2.0 / len(mask))
     return log_depth[rows, columns] + slope[..., 0] * (x - columns) + slope[..., 1] * (y - rows)
 
 

@@ -13,7 +13,7 @@ from experiments.study import Options, read_rows
 
 
 def test_the_spline_integrates_exact_normals_to_the_surface() -> None:
-    batch = simulate(1, dense.SIZE, (9, 1), (0.0, 0.0))
+    batch = simulate(2, dense.SIZE, (9, 1), (0.0, 0.0))
     difference = (dense.integrated(batch) - batch.log_depth)[batch.mask]
     assert np.std(difference) < 1e-3 * np.std(batch.log_depth[batch.mask])
 
