@@ -14,6 +14,8 @@ from importlib import metadata
 from pathlib import Path
 
 Row = dict[str, str | int | float]
+Columns = Mapping[str, Callable[[Row], str]]
+"""What a column of the Markdown table shows of a row."""
 FAILURE = "failure"
 
 
@@ -39,7 +41,7 @@ class Table:
             print(f"  failed: {row[FAILURE]}", flush=True)
         self.rows = [old for old in self.rows if any(old[key] != value for key, value in keys.items())] + [row]
 
-    def write(self, columns: Mapping[str, Callable[[Row], str]]) -> None:
+    def write(self, columns: Columns) -> None:
         """Write the rows, and as Markdown what `columns` make of them; a failed row shows its keys and why."""
         self._folder.mkdir(parents=True, exist_ok=True)
         names = [*dict.fromkeys(name for row in self.rows for name in row if name != FAILURE), FAILURE]

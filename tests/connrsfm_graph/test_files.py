@@ -1,13 +1,22 @@
-"""Files are whole or absent."""
+"""Files are whole or absent, and archives are read without more memory than needed."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from connrsfm_graph import files
 from connrsfm_graph.errors import InputError
-from connrsfm_graph.files import check_output_folder, folder_written_beside, written_beside
+from connrsfm_graph.files import (
+    check_output_folder,
+    folder_written_beside,
+    read_npz,
+    release,
+    write_npz,
+    written_beside,
+)
 
 
 def test_failed_write_keeps_the_old_file(tmp_path: Path) -> None:
@@ -62,3 +71,39 @@ def test_output_that_is_a_file_or_below_one_is_refused(tmp_path: Path) -> None:
         check_output_folder(tmp_path / "file" / "below")
     with pytest.raises(InputError, match="is a folder, expected the name of a file"), written_beside(tmp_path):
         pass
+
+
+def test_large_arrays_are_mapped_and_numpy_reads_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(files, "LARGE", 1000)
+    path = tmp_path / "x.npz"
+    rng = np.random.default_rng(0)
+    arrays = {
+        "small": rng.normal(size=5),
+        "large": rng.normal(size=(40, 7)),
+        "fortran": np.asfortranarray(rng.normal(size=(40, 7))),
+        "flags": rng.uniform(size=2000) < 0.5,
+        "name": np.array("x"),
+    }
+    write_npz(path, arrays)
+    written = path.read_bytes()
+    found = read_npz(path)
+    with np.load(path, allow_pickle=False) as archive:
+        assert archive.zip.testzip() is None
+        for name, array in arrays.items():
+            np.testing.assert_array_equal(archive[name], array)
+            np.testing.assert_array_equal(found[name], array)
+            mapped = isinstance(found[name].base, np.memmap)
+            assert mapped == (name in ("large", "fortran"))
+            assert found[name].flags.aligned
+    found["large"][:] = 0.0  # of this process alone
+    write_npz(tmp_path / "again.npz", arrays)
+    assert (tmp_path / "again.npz").read_bytes() == path.read_bytes() == written
+
+
+def test_memory_of_a_mapped_array_is_released_and_its_content_kept(tmp_path: Path) -> None:
+    array = np.lib.format.open_memmap(tmp_path / "x.npy", mode="w+", dtype=float, shape=(1000,))
+    array[:] = np.arange(1000)
+    release(array)
+    assert array[-1] == 999
+    assert np.load(tmp_path / "x.npy")[-1] == 999
+    release(np.zeros(3))  # nothing to do
