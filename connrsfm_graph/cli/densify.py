@@ -29,6 +29,8 @@ def run(arguments: argparse.Namespace) -> None:
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file, expected the folder that 'reconstruct' wrote")
     reconstruction = Reconstruction.load(out)
+    if not reconstruction.camera.kappa:
+        raise InputError(f"{out}: was seen by an orthographic camera, densify needs a perspective one")
     progress = Progress()
     with progress.stage("densify"):
         index = densify(reconstruction, arguments.images, out, arguments.method, arguments.checkpoint, progress.update)

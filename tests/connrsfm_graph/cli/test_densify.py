@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from connrsfm_graph.dense import choose
 from connrsfm_graph.reconstruction import RESULT_FILE
+from factors.surface import ORTHOGRAPHIC
 from tests.connrsfm_graph.cli.conftest import Ended
 from tests.connrsfm_graph.dense.surface import sheet, write_images
 
@@ -59,6 +61,13 @@ def test_without_a_result_or_images_it_is_one_sentence(connrsfm: Command, result
     ended = connrsfm("densify", result, "--images", tmp_path / "nowhere")
     assert ended.status == 2
     assert ended.err.count("\n") == 1
+
+
+def test_surfaces_seen_by_an_orthographic_camera_are_refused(connrsfm: Command, result: Path, tmp_path: Path) -> None:
+    replace(sheet(), camera=ORTHOGRAPHIC).save(result / RESULT_FILE)
+    ended = connrsfm("densify", result, "--images", write_images(tmp_path / "images"))
+    assert ended.status == 2
+    assert "was seen by an orthographic camera" in ended.err
 
 
 def test_train_depth_writes_a_checkpoint(connrsfm: Command, tmp_path: Path) -> None:
