@@ -54,7 +54,7 @@ MIXED = Experiment("mixed", "Synthetic 2: 10 images, isometric and conformal", _
 def _orthographic(options: Options) -> Iterable[Case]:
     """Ours only: the baselines are for perspective cameras."""
     size = {"n_frames": 4, "n_points": 40} if options.quick else {"n_frames": 7, "n_points": 100}
-    scenes = {
+    scenes: dict[str, Callable[..., Scene]] = {
         "spheres": spheres,
         "bending": isometric_bending,
         "bending, smooth": partial(isometric_bending, smooth=True),
