@@ -10,6 +10,7 @@ from typing import Any
 
 from connrsfm_graph.errors import ComputationError, InputError
 from connrsfm_graph.others import Guide
+from connrsfm_graph.reconstruction import package_versions
 from connrsfm_graph.running.block import Block, Finished, work_on
 
 _SECONDS = 10
@@ -25,7 +26,8 @@ class Cluster:
     def __init__(self, address: str) -> None:
         """
         Raises:
-            InputError: dask.distributed is not installed, no scheduler answers, or it has no workers.
+            InputError: dask.distributed is not installed, no scheduler answers, it has no workers, or these have other
+                versions of the packages that compute.
         """
         try:
             from distributed import Client
@@ -47,6 +49,15 @@ class Cluster:
             raise InputError(
                 f"cluster {address}: the scheduler has no workers; start some with 'dask worker'"
             ) from error
+        here = package_versions()
+        for worker, there in self._client.run(_versions).items():
+            for package, version in here.items():
+                if there.get(package) != version:
+                    self._client.close()
+                    raise InputError(
+                        f"cluster {address}: {worker} has {package} {there.get(package)}, expected {version} as here, "
+                        "so that results do not depend on who works"
+                    )
 
     def __enter__(self) -> Cluster:
         return self
@@ -79,6 +90,11 @@ class Cluster:
 
     def _submitted(self, known: Any, block: Block) -> Any:
         return self._client.submit(_worked_on, known, block, pure=False)
+
+
+def _versions() -> dict[str, str]:
+    """Of a worker."""
+    return package_versions()
 
 
 def _unpacked(guide: bytes) -> Guide:

@@ -15,11 +15,25 @@ from connrsfm_graph.running.block import Finished
 from connrsfm_graph.running.cluster import Cluster
 
 
-@pytest.mark.slow
-def test_a_killed_worker_of_the_cluster_costs_nothing(work, check):
+@pytest.fixture(scope="module")
+def scheduler() -> Iterator[str]:
+    """Address of a scheduler with two worker processes."""
     distributed = pytest.importorskip("distributed")
     local = distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50)
-    with local, Cluster(local.scheduler_address) as crew:
+    with local:
+        yield local.scheduler_address
+
+
+@pytest.mark.slow
+def test_workers_of_another_version_are_refused(scheduler, monkeypatch):
+    monkeypatch.setattr("connrsfm_graph.running.cluster.package_versions", lambda: {"numpy": "0.9"})
+    with pytest.raises(InputError, match=r"has numpy 2.*, expected 0\.9 as here"):
+        Cluster(scheduler)
+
+
+@pytest.mark.slow
+def test_a_killed_worker_of_the_cluster_costs_nothing(work, check, scheduler):
+    with Cluster(scheduler) as crew:
 
         def answers() -> Iterator[Finished]:
             for n, finished in enumerate(crew.work(work.guide, work.blocks)):
