@@ -30,6 +30,8 @@ _STILL = 1e-8
 """Images of which less than this share of the layout changes do not differ (see `image_graph.image_change`)."""
 _COMPARISONS = 8
 """Other images each image's handedness is compared with."""
+_AT_ONCE = 256
+"""Images whose handedness is found together; bounds the memory, not the result."""
 
 
 def check_reconstructable(tracks: Tracks, source: str = "tracks") -> tuple[Tracks, tuple[str, ...]]:
@@ -144,13 +146,14 @@ def _refuse_mirrored(tracks: Tracks, source: str) -> None:
     others = np.unique(np.linspace(1, F - 1, min(_COMPARISONS, F - 1)).round().astype(int))
     flipped = np.zeros(F, dtype=int)
     compared = np.zeros(F, dtype=int)
-    for frame in range(F):
-        for other in (frame + others) % F:
-            both = tracks.visible[frame] & tracks.visible[other]
-            if both.sum() < MIN_POINTS:
-                continue
-            flipped[frame] += _handedness(tracks.pixels[frame, both], tracks.pixels[other, both]) < 0
-            compared[frame] += 1
+    for first in range(0, F, _AT_ONCE):
+        frames = np.arange(first, min(first + _AT_ONCE, F))
+        for other in others:
+            second = (frames + other) % F
+            both = tracks.visible[frames] & tracks.visible[second]
+            enough = both.sum(axis=1) >= MIN_POINTS
+            flipped[frames] += enough & (_handedness(tracks.pixels[frames], tracks.pixels[second], both) < 0)
+            compared[frames] += enough
     mirrored = np.flatnonzero(2 * flipped > compared)
     if len(mirrored):
         raise InputError(
@@ -170,13 +173,15 @@ def _refuse_still(tracks: Tracks, source: str) -> None:
         )
 
 
-def _handedness(a: np.ndarray, b: np.ndarray) -> float:
-    """Sign of the determinant of the affinity that best maps points a to b, (N, 2) each; 0 where nearly singular."""
-    a, b = a - a.mean(axis=0), b - b.mean(axis=0)
-    A = np.linalg.lstsq(a, b, rcond=None)[0]
-    size = np.linalg.norm(A)
+def _handedness(a: np.ndarray, b: np.ndarray, both: np.ndarray) -> np.ndarray:
+    """(N,) sign of the determinant of the affinities that best map points a to b, (N, P, 2) each, where both (N, P) are
+    seen; 0 where nearly singular."""
+    seen = both[..., None]
+    count = np.maximum(seen.sum(axis=1, keepdims=True), 1)
+    a, b = (np.where(seen, x - np.where(seen, x, 0.0).sum(axis=1, keepdims=True) / count, 0.0) for x in (a, b))
+    A = np.linalg.pinv(a.mT @ a, hermitian=True) @ (a.mT @ b)
     det = np.linalg.det(A)
-    return 0.0 if abs(det) <= 0.01 * size**2 else float(np.sign(det))
+    return np.where(np.abs(det) <= 0.01 * (A**2).sum(axis=(1, 2)), 0.0, np.sign(det))
 
 
 def _rarely_seen(tracks: Tracks, source: str) -> list[str]:
