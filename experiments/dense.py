@@ -77,7 +77,7 @@ def measure(options: Options) -> None:
                 figures = {
                     "error_percent": f"{100 * statistics.fmean(errors):.3g}",
                     "median_percent": f"{100 * statistics.median(errors):.3g}",
-                    "milliseconds": f"{milliseconds:.2g}",
+                    "milliseconds": f"{milliseconds:.1f}",
                 }
                 append_row(path, dict(zip(("table", "method", "condition"), keys, strict=True)) | figures)
     text = _markdown(read_rows(path))
@@ -202,23 +202,24 @@ def _trained(config: TrainConfig, file: Path, noise: float) -> Figures:
 
 
 def _markdown(rows: list[Row]) -> str:
-    """A table per kind of measurement, a line per method and a column per condition: error and milliseconds."""
-    lines = []
-    for table in dict.fromkeys(row["table"] for row in rows):
+    """A table per kind of measurement, a line per method and a column per condition."""
+    lines = ["### Dense depth: mean relative error in percent / its median (milliseconds per image)", ""]
+    for table in ("simulated", "real", "ablation"):
         own = [row for row in rows if row["table"] == table]
         conditions = list(dict.fromkeys(row["condition"] for row in own))
-        lines += [f"### {table}: error of depth in percent: mean, median (milliseconds per image)", ""]
-        lines += [f"| method | {' | '.join(conditions)} |", f"|---|{'---|' * len(conditions)}"]
+        if own:
+            lines += [f"| {table} | {' | '.join(conditions)} |", f"|---|{'---|' * len(conditions)}"]
         for method in dict.fromkeys(row["method"] for row in own):
             found = {row["condition"]: row for row in own if row["method"] == method}
             cells = [_cell(found[condition]) if condition in found else "" for condition in conditions]
             lines.append(f"| {method} | {' | '.join(cells)} |")
-        lines.append("")
+        lines += [""] * bool(own)
     return "\n".join(lines)
 
 
 def _cell(row: Row) -> str:
-    return f"{row['error_percent']}, {row['median_percent']} ({row['milliseconds']})"
+    mean, median = row["error_percent"], row["median_percent"]
+    return f"{mean if mean == median else f'{mean} / {median}'} ({row['milliseconds']})"
 
 
 def draw_training(checkpoint: Checkpoint, path: Path) -> None:
