@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -77,6 +78,7 @@ class Surfaces:
         # The farthest few points may be gross errors that would shrink everything else.
         return np.nanquantile(shown, 0.995, axis=1).max(axis=0)
 
+    @cached_property
     def radius(self) -> float:
         """World units from the centre that a view from any side must show to hold every image."""
         distance = np.linalg.norm((self.points - self.centre[:, None])[self.frames], axis=2)

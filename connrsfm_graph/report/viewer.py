@@ -85,7 +85,7 @@ def _frame(
 ) -> dict[str, Any]:
     """One image's surface about its centre in units of the largest one's radius, and its colours."""
     mesh = shown_mesh(reconstruction, surfaces, dense, f, most)
-    unit, centre = surfaces.radius(), surfaces.centre[f]
+    unit, centre = surfaces.radius, surfaces.centre[f]
     frame: dict[str, Any] = {
         "name": reconstruction.frame_name(f),
         "points": _packed(_steps((mesh.points - centre) / unit), "<i2"),

@@ -156,7 +156,7 @@ def _numeric(array: np.ndarray, what: str) -> np.ndarray:
     array = np.asarray(array)
     if array.dtype.kind not in "fiu":
         raise InputError(f"{what} holds {array.dtype} values, expected numbers")
-    return array.astype(np.float64)
+    return array.astype(np.float64, copy=False)
 
 
 def _truth(array: np.ndarray | None, shape: tuple[int, ...], what: str) -> np.ndarray | None:
@@ -167,7 +167,7 @@ def _truth(array: np.ndarray | None, shape: tuple[int, ...], what: str) -> np.nd
         raise InputError(f"{what} has shape {array.shape}, expected {shape}")
     if (largest := np.abs(np.where(np.isfinite(array), array, 0.0)).max()) > _LARGEST:
         raise InputError(f"{what} holds numbers as large as {largest:.3g}, expected coordinates in some unit of length")
-    return array
+    return array.copy()
 
 
 def _check_intrinsics(K: np.ndarray, source: str) -> None:
