@@ -54,9 +54,11 @@ def densify(
         progress: called with (images done, images).
 
     Raises:
-        InputError: images that are not those of the tracks, cannot be read or are of different sizes, or no image with
-            enough points; and those of `dense.choose`.
+        InputError: the camera was orthographic; images that are not those of the tracks, cannot be read or are of
+            different sizes; no image with enough points; and those of `dense.choose`.
     """
+    if not reconstruction.camera.kappa:
+        raise InputError("the reconstruction is of an orthographic camera, dense surfaces need a perspective one")
     sparse = [SparsePoints.of(reconstruction, f) for f in range(reconstruction.n_frames)]
     problems = [_problem(points) for points in sparse]
     usable = [f for f, problem in enumerate(problems) if problem is None]

@@ -15,6 +15,7 @@ from connrsfm_graph.dense.densify import FEWEST_POINTS, densify
 from connrsfm_graph.dense.layout import DENSE_FOLDER, DenseIndex, read_depth
 from connrsfm_graph.errors import InputError
 from connrsfm_graph.export.depth_png import read_depth_png
+from factors.surface import ORTHOGRAPHIC
 from tests.connrsfm_graph.dense.surface import SIZE, sheet, true_log_depth, write_images
 
 PIXELS = np.stack(np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1])), axis=-1).astype(float)
@@ -90,6 +91,11 @@ def test_images_with_few_points_are_left_out_with_a_reason(tmp_path: Path, image
     assert [(item["frame"], item["name"]) for item in index.skipped] == [(1, "001.png")]
     with pytest.raises(InputError, match=r"no image has a dense surface; 000\.png has 0 recovered points"):
         densify(replace(true, visible=np.zeros_like(visible)), images, tmp_path, "spline")
+
+
+def test_orthographic_cameras_are_refused(tmp_path: Path, images: Path) -> None:
+    with pytest.raises(InputError, match="of an orthographic camera"):
+        densify(replace(sheet(), camera=ORTHOGRAPHIC), images, tmp_path, "spline")
 
 
 def test_points_on_a_line_span_no_surface(tmp_path: Path, images: Path) -> None:
