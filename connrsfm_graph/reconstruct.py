@@ -161,17 +161,21 @@ def _reconstruct(
     account = joint.account
     decisions = account.decisions | {"keyframes": {"jointly": len(keys), "following": n_following}}
     if n_following:
-        decisions["running"] = {"processes at work": len(peaks), "images in a block": plan.block}
+        decisions["running"] = {"processes at work": max(len(peaks), 1), "images in a block": plan.block}
+    warnings = [*problem_warnings((*account.problems, *gathering.problems())), *account.warnings]
+    peak = peak_memory_mib() + sum(peaks.values())
+    if config.running.memory_limit is not None and peak * 2**20 > config.running.memory():
+        warnings.append(f"the run took {peak:.0f} MiB, more than running.memory_limit ({config.running.memory_limit})")
     record = RunRecord(
         source="",
         method="connrsfm",
         seed=config.seed,
         configuration=as_dict(config),
         decisions=decisions,
-        warnings=(*problem_warnings((*account.problems, *gathering.problems())), *account.warnings),
+        warnings=tuple(warnings),
         cost_history=account.cost_history,
         seconds=dict(progress.seconds),
-        peak_memory_mib=peak_memory_mib() + sum(peaks.values()),
+        peak_memory_mib=peak,
         versions=package_versions(),
     )
     return gathering.result(), record

@@ -11,7 +11,7 @@ from connrsfm_graph.reconstruction import Reconstruction
 from connrsfm_graph.running import crew
 from connrsfm_graph.running.checkpoints import Checkpoints
 
-from .conftest import FEW, assert_same
+from .conftest import FEW, assert_same, with_settings
 
 
 def test_a_result_on_disk_is_that_in_memory(work, tmp_path, monkeypatch):
@@ -29,3 +29,10 @@ def test_a_result_on_disk_is_that_in_memory(work, tmp_path, monkeypatch):
     kept.remove()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.npz", "b.npz"]
     np.testing.assert_array_equal(on_disk.points, Reconstruction.load(tmp_path / "a.npz").points)
+
+
+def test_more_memory_than_allowed_is_said(work, monkeypatch):
+    monkeypatch.setattr("connrsfm_graph.reconstruct.peak_memory_mib", lambda: 600.0)
+    _, record = reconstruct(work.tracks, with_settings(memory_limit="512MiB"))
+    assert record.peak_memory_mib == 600.0
+    assert "the run took 600 MiB, more than running.memory_limit (512MiB)" in record.warnings
