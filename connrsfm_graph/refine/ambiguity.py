@@ -6,8 +6,8 @@ view of a purely conformal reconstruction is known up to one inversion. What dec
 1. Isometry. Two views, declared or found to be isometric, have equal conformal factors up to a constant; inverting
    one or both spoils that (unless they are seen from the same place).
 2. The trace-free second fundamental form. Where the surface deforms like a piece of space under Moebius maps, it is
-   the same in all views up to scale, and inverting a view turns its sign. If all pairs of views agree in that, all
-   views are decided but for one common inversion.
+   the same in all views up to scale, and inverting a view turns its sign. Where the views share one form but for signs,
+   they are decided but for one common inversion; a view that agrees too little with the others remains open.
 3. The least variation of the conformal factor: a convention rather than knowledge. What only this has decided is
    reported as ambiguous.
 """
@@ -28,8 +28,17 @@ _ISOMETRIC = 0.005
 """Two views are isometric where the standard deviation of their difference in log conformal factor is below this."""
 _MARGIN = 5.0
 """It must be larger by this factor for any other choice of inversions of the two."""
-_AGREEMENT = 0.5
-"""Least correlation of the trace-free second fundamental forms of any two views that counts as agreement."""
+_AGREEMENT = 0.95
+"""Least agreement of the views' signs at which these are believed."""
+_SAME_FORM = (0.5, 0.2)
+"""The views share one form where all correlations are above the first, or where this part of them at most is not
+explained by one common form and each view's own noise."""
+_MANY = 5
+"""Views from which on the latter can be told."""
+_LEAST_MARGIN = 0.1
+"""Least mean correlation of a view with the others for its sign to be told."""
+_FACTOR_STEPS = 50
+"""Iterations of the fit of one common form."""
 _CLIP = 3.0
 """Entries of these forms count up to so many times their median."""
 
@@ -57,16 +66,19 @@ def resolve(shape: Shape, image: np.ndarray, mesh: Mesh, declared: np.ndarray) -
     """
     flip, isometric = isometric_views(shape, image, declared)
     shape = inverted(shape, image, flip)
-    correlation = shear_correlation(shape.points(image), mesh)
-    sign = np.sign(correlation[int(isometric.argmax())])
-    sign[sign == 0] = 1.0
-    if (correlation * np.outer(sign, sign) >= _AGREEMENT).all() and len(sign) > 1 and (sign[isometric] > 0).all():
+    agreed = consensus(shear_correlation(shape.points(image), mesh))
+    sign = agreed.sign * (agreed.sign[int(isometric.argmax())] if isometric.any() else 1.0)
+    if agreed.agreement >= _AGREEMENT and (sign[isometric] > 0).all() and (agreed.same_form or not isometric.any()):
+        told = isometric | (agreed.margin >= _LEAST_MARGIN)
         # Without a decided view the majority stays as it is.
-        if not isometric.any() and (sign > 0).sum() < len(sign) / 2:
+        if not isometric.any() and (sign[told] > 0).sum() < told.sum() / 2:
             sign = -sign
-        shape = inverted(shape, image, sign < 0)
-        group = np.full(len(sign), 0 if isometric.any() else 1)
-        return shape, Ambiguity(group, isometric, "the trace-free second fundamental form is kept up to scale")
+        shape = inverted(shape, image, told & (sign < 0))
+        if agreed.same_form:
+            group = np.where(told, 0 if isometric.any() else 1, 1 + np.cumsum(~told))
+            return shape, Ambiguity(group, isometric, "the trace-free second fundamental form is kept up to scale")
+        assumption = "the trace-free second fundamental forms agree as well as they can"
+        return shape, Ambiguity(np.cumsum(~isometric), isometric, assumption)
     group = np.where(isometric, 0, np.cumsum(~isometric))
     if isometric.all():
         return shape, Ambiguity(group, isometric, "all views are isometric to another one")
@@ -108,11 +120,55 @@ def _spreads(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.asarray((a[:, None] - b[None]).std(axis=-1))
 
 
+@dataclass(frozen=True)
+class Consensus:
+    """What the correlations of the views' forms say."""
+
+    sign: np.ndarray
+    """(F,) 1.0 or -1.0, with which the views agree best."""
+    agreement: float
+    """How far they then agree; 1 where all pairs do."""
+    margin: np.ndarray
+    """(F,) mean correlation of each view with the others, signs applied."""
+    same_form: bool
+    """Whether there is one form common to all views. Else signs may agree by chance, as bends about two axes do."""
+
+
+def consensus(correlation: np.ndarray) -> Consensus:
+    """Signs that make the views agree best, from the correlations (F, F) of their forms."""
+    F = len(correlation)
+    between = correlation - np.diag(np.diag(correlation))
+    sign = np.where(np.linalg.eigh(between)[1][:, -1] >= 0.0, 1.0, -1.0)
+    signed = between * np.outer(sign, sign)
+    sum_of_sizes = max(float(np.abs(between).sum()), 1e-300)
+    least, unexplained = _SAME_FORM
+    others = ~np.eye(F, dtype=bool)
+    return Consensus(
+        sign=sign,
+        agreement=float(signed.sum()) / sum_of_sizes,
+        margin=signed.sum(axis=1) / max(F - 1, 1),
+        same_form=bool((signed[others] >= least).all()) or (F >= _MANY and _unexplained(between) <= unexplained),
+    )
+
+
+def _unexplained(between: np.ndarray) -> float:
+    """Root mean square of what no product of one number per view explains of correlations (F, F), relative to them."""
+    loading = np.zeros(len(between))
+    for _ in range(_FACTOR_STEPS):
+        value, vector = np.linalg.eigh(between + np.diag(np.minimum(loading**2, 1.0)))
+        loading = vector[:, -1] * np.sqrt(max(value[-1], 0.0))
+    product = np.outer(loading, loading)
+    np.fill_diagonal(product, 0.0)
+    return float(np.linalg.norm(between - product)) / max(float(np.linalg.norm(between)), 1e-300)
+
+
 def shear_correlation(points: np.ndarray, mesh: Mesh) -> np.ndarray:
-    """(F, F) correlations of the views' trace-free second fundamental forms over the near edges of the mesh."""
-    near = mesh.edges[: mesh.n_near]
-    shear = np.empty((len(points), len(near), 2))
-    over_views(shear_kernel, len(points), np.ascontiguousarray(points), mesh.triangles, near, shear)
+    """(F, F) correlations of the views' trace-free second fundamental forms over the edges of the mesh.
+
+    The two-ring is part of it: curvatures from near neighbours alone drown in little noise.
+    """
+    shear = np.empty((len(points), len(mesh.edges), 2))
+    over_views(shear_kernel, len(points), np.ascontiguousarray(points), mesh.triangles, mesh.edges, shear)
     flat = shear.reshape(len(points), -1)
     flat /= np.maximum(np.median(np.abs(flat), axis=1, keepdims=True), 1e-300)
     flat = np.clip(flat, -_CLIP, _CLIP)

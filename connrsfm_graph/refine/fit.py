@@ -35,6 +35,8 @@ _SUSPECT = (1.5, 0.02)
 """So may one of an isometric fit that costs so many times the lower quartile of the views, and so much per edge."""
 _MISFIT = 1.0
 """Isometry is in doubt where its squared residuals exceed this many assumed variances on average."""
+_DOUBT = 0.15
+"""The same for the conformal model, which bends to many a wrong shape: its fit is then repeated from flat views."""
 _RATIO = 6.0
 """The conformal model must then lower the cost by this factor: its many unknowns alone already gain a lot."""
 
@@ -172,18 +174,18 @@ def fit_isometric(task: Task, noise: Noise) -> Fit:
 
 
 def fit_conformal(task: Task, noise: Noise) -> Fit:
-    """Conformal fit from the start: all views restarted until none gains, then inversions resolved.
+    """Conformal fit from the start, or from flat views where that remains in doubt, then inversions resolved.
 
     Views declared isometric are held to it only in the end: on the way it would keep wrong shapes from turning right.
     """
     measurements = task.measurements(noise, declared=False)
-    shape, history = _minimise(task, measurements, start_shape(task.completed, task.mesh, conformal=True))
-    for _ in range(_RESTARTS):
-        shape, renewed = restart(measurements, shape)
-        if not renewed.any():
-            break
-        shape, more = _minimise(task, measurements, shape)
-        history += more
+    shape, history = _restarted(task, measurements, start_shape(task.completed, task.mesh, conformal=True))
+    (F, P), E = shape.log_depth.shape, len(shape.log_length)
+    if 2.0 * history[-1] > _DOUBT * max(F * E - 2 * F * P - E, 1):
+        flat = replace(task.completed, log_depth=np.zeros((F, P)))
+        second, more = _restarted(task, measurements, start_shape(flat, task.mesh, conformal=True))
+        if more[-1] < history[-1]:
+            shape, history = second, history + more
     shape, ambiguity = resolve(shape, measurements.image, task.mesh, task.declared)
     measurements = task.measurements(noise)
     shape, more = _minimise(task, measurements, shape)
@@ -191,14 +193,26 @@ def fit_conformal(task: Task, noise: Noise) -> Fit:
     alternative = None
     if ambiguity.group.any():
         alternative, other = _minimise(task, measurements, inverted(shape, measurements.image, ambiguity.group > 0))
-        # Where one inversion is common to all undecided views, the conformal factors decide which varies less.
-        if ambiguity.group.max() == 1 and other[-1] < history[-1]:
+        # Where one inversion is common to several undecided views, the conformal factors decide which varies less.
+        if np.count_nonzero(ambiguity.group == 1) > 1 and other[-1] < history[-1]:
             shape, alternative = alternative, shape
             history += other
     found = _settled(task, Fit(measurements, shape, noise, history, history[-1]))
     found.evidence["conformal factors rest on"] = ambiguity.assumption
     found.evidence["views that might be inverted"] = np.flatnonzero(ambiguity.group).tolist()
     return replace(found, ambiguity=ambiguity, alternative=alternative)
+
+
+def _restarted(task: Task, measurements: Measurements, shape: Shape) -> tuple[Shape, list[float]]:
+    """Minimum from a shape, all views restarted until none gains, and the costs on the way."""
+    shape, history = _minimise(task, measurements, shape)
+    for _ in range(_RESTARTS):
+        shape, renewed = restart(measurements, shape)
+        if not renewed.any():
+            break
+        shape, more = _minimise(task, measurements, shape)
+        history += more
+    return shape, history
 
 
 def _minimise(task: Task, measurements: Measurements, shape: Shape) -> tuple[Shape, list[float]]:

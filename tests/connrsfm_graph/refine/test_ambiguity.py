@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from connrsfm_graph.refine.ambiguity import resolve, shear_correlation
+from connrsfm_graph.refine.ambiguity import consensus, resolve, shear_correlation
 from connrsfm_graph.refine.cost import Weights
 from connrsfm_graph.refine.restarts import inverted
 from connrsfm_graph.refine.solve import Measurements, Shape, costs, lag
@@ -14,11 +14,11 @@ from connrsfm_graph.refine.unseen import complete
 from connrsfm_graph.synthetic import Scene, isometric_bending, mixed, moebius
 
 
-def true_shape(scene: Scene) -> tuple[Measurements, Shape]:
+def true_shape(scene: Scene, rings: int = 1) -> tuple[Measurements, Shape]:
     """The truth as a conformal shape, and the measurements it fulfils; views in a scale of their own."""
     seen = scene.tracks.visible
     completed = complete(scene.image, seen, scene.log_depth)
-    mesh = start_mesh(completed, seen, rings=1)
+    mesh = start_mesh(completed, seen, rings)
     factor = scene.log_size - scene.log_size.mean(axis=1, keepdims=True)
     log_depth = scene.log_depth - scene.log_size.mean(axis=1, keepdims=True)
     shape = Shape(log_depth, np.zeros((*seen.shape, 2)), factor, np.zeros(len(mesh.edges)))
@@ -71,6 +71,34 @@ def test_moebius_images_are_decided_up_to_one_common_inversion():
     assert found.log_depth == pytest.approx(shape.log_depth, abs=1e-9)
     assert ambiguity.group.tolist() == [1] * 5
     assert "second fundamental form" in ambiguity.assumption
+
+
+def test_noise_leaves_the_consensus_of_the_views_as_it_is():
+    """Single pairs of views hardly correlate under noise; all together tell which are inverted."""
+    measurements, shape = true_shape(moebius(n_frames=7, n_points=150), rings=2)
+    flip = np.array([False, True, False, True, False, False, False])
+    points = inverted(shape, measurements.image, flip).points(measurements.image)
+    points *= 1.0 + 0.001 * np.random.default_rng(0).standard_normal((*points.shape[:2], 1))
+    correlation = shear_correlation(points, measurements.mesh)
+    found = consensus(correlation)
+    assert np.abs(correlation).min() < 0.5
+    assert found.agreement > 0.95
+    assert found.same_form
+    assert (found.sign * found.sign[0] < 0).tolist() == flip.tolist()
+    assert found.margin.min() > 0.1
+
+
+def test_bends_about_several_axes_share_no_form():
+    for seed in range(4):
+        measurements, shape = true_shape(mixed(n_frames=6, n_points=100, seed=seed), rings=2)
+        assert not consensus(shear_correlation(shape.points(measurements.image), measurements.mesh)).same_form
+
+
+def test_a_view_unlike_the_others_has_no_margin():
+    found = consensus(np.array([[1.0, 0.9, 0.02], [0.9, 1.0, 0.01], [0.02, 0.01, 1.0]]))
+    assert found.sign[0] == found.sign[1]
+    assert found.margin[2] < 0.1 < found.margin[0]
+    assert not found.same_form
 
 
 def test_isometric_views_are_found_and_turned_right():
