@@ -73,8 +73,8 @@ def gtsam_step(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, ordering
     return damped(graph.linearize(values), values, DAMPING).optimize(ordering)
 
 
-def scipy_iteration(problem: Problem, state: State, point: int, active: tuple[str, ...]) -> None:
-    """One iteration of scipy's trust-region reflective solver on one point."""
+def scipy_iteration(problem: Problem, state: State, point: int, active: tuple[str, ...]) -> Callable[[], object]:
+    """One iteration of scipy's trust-region reflective solver on one point, to be timed."""
     graph, values = point_graph(problem, state, point, active, NOISE)
     ordering = gtsam.Ordering.ColamdNonlinearFactorGraph(graph)
     delta = values.zeroVectors()
@@ -93,7 +93,7 @@ def scipy_iteration(problem: Problem, state: State, point: int, active: tuple[st
     def jacobian(x: np.ndarray) -> csr_array:
         return csr_array(graph.linearize(moved(x)).jacobian(ordering)[0])
 
-    least_squares(residual, np.zeros(sum(sizes)), jacobian, method="trf", max_nfev=2)
+    return partial(least_squares, residual, np.zeros(sum(sizes)), jacobian, method="trf", max_nfev=2)
 
 
 def largest_difference(step: gtsam.VectorValues, values: gtsam.Values, before: State, after: State) -> float:
@@ -108,12 +108,12 @@ def largest_difference(step: gtsam.VectorValues, values: gtsam.Values, before: S
     return worst
 
 
-def built_in_iteration(problem: Problem, state: State, point: int, active: tuple[str, ...]) -> None:
-    """One iteration of GTSAM's own Levenberg-Marquardt on one point."""
+def built_in_iteration(problem: Problem, state: State, point: int, active: tuple[str, ...]) -> Callable[[], object]:
+    """One iteration of GTSAM's own Levenberg-Marquardt on one point, to be timed."""
     graph, values = point_graph(problem, state, point, active, NOISE)
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setlambdaInitial(DAMPING)
-    gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).iterate()
+    return gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).iterate
 
 
 def torch_steps(problem: Problem, state: State, active: tuple[str, ...], expected: State) -> dict[str, float]:
@@ -158,9 +158,9 @@ def measure_iteration(out: Path, frames: int = 159, points: int = 300, repeats: 
         if not gap < SAME_STEP:
             raise RuntimeError(f"the steps of GTSAM and of the executor differ by {gap:.1e}")
 
-        def per_point(work: Callable[[Problem, State, int, tuple[str, ...]], None], active: tuple[str, ...]) -> float:
+        def per_point(made: Callable[..., Callable[[], object]], active: tuple[str, ...]) -> float:
             sample = range(min(SAMPLE, points))
-            return statistics.median(timed(partial(work, problem, state, i, active), 1) for i in sample) * points
+            return statistics.median(timed(made(problem, state, i, active), 1) for i in sample) * points
 
         seconds = {
             "batched": timed(partial(backend.step, problem, state, active, NOISE, damping=DAMPING), repeats),
