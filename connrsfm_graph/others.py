@@ -77,10 +77,11 @@ def reconstruct_others(guide: Guide, image: np.ndarray, visible: np.ndarray) -> 
     constrained = pairs.constrained().T[K:] & visible
     surfaces, _ = surfaces_of_points(found, constrained, guide.camera, guide.bending)
     frame = np.concatenate([guide.surfaces.frame(), surfaces.frame()], axis=1)
+    log_factor = np.concatenate([guide.surfaces.log_factor, surfaces.log_factor])
     return Others(
         surfaces=surfaces,
         keyframe=nearest,
         edge_weight=(guide.visible[nearest] & visible).sum(axis=1).astype(float),
-        conformal_scale=scales(pairs, frame),
+        conformal_scale=scales(pairs, frame, log_factor),
         problem=tuple(report.problem for report in warps.reports),
     )

@@ -229,7 +229,7 @@ def reconstruct_jointly(
         else:
             constrained = problem.constrained().T & visible
             surfaces, bending = surfaces_of_points(refined, constrained, problem.camera)
-        conformal_scale = scales(problem, surfaces.frame())
+        conformal_scale = scales(problem, surfaces.frame(), surfaces.log_factor)
     return Joint(graph, warps, problem, solved, refined, surfaces, conformal_scale, bending)
 
 

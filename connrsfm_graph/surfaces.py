@@ -107,8 +107,20 @@ def surfaces_of_points(
     )
 
 
-def scales(problem: Problem, frame: np.ndarray) -> np.ndarray:
-    """(E, P) conformal scales of the problem's edges between given surfaces (P, F, 6), NaN where a pair is absent."""
+def scales(problem: Problem, frame: np.ndarray, log_factor: np.ndarray) -> np.ndarray:
+    """(E, P) conformal scales of the problem's edges between given surfaces, NaN where a pair is absent.
+
+    Where the refinement found conformal factors, the log scale is their difference. Otherwise it comes from the metric
+    rows, and with it the errors of the warps' derivatives.
+
+    Args:
+        problem: edges and warps.
+        frame: (P, F, 6) variables of the surfaces.
+        log_factor: (F, P) log conformal factors; zero in an isometric model, NaN where not estimated.
+    """
+    if np.nan_to_num(log_factor).any():
+        a, b = problem.edges.T
+        return np.where(problem.weight.T > 0, np.exp(log_factor[a] - log_factor[b]), np.nan)
     state = State(np.ascontiguousarray(frame), np.zeros((problem.n_points, problem.n_edges)))
     scaled = with_closed_form_scale(problem, state, METRIC_ONLY)
     return np.where(problem.weight > 0, np.exp(scaled.log_scale), np.nan).T

@@ -109,6 +109,9 @@ def test_moebius_images_are_found_conformal() -> None:
             for j in range(1, 5)
         ]
         assert np.median(differences) > 0.95
+        found, truth = np.log(result.conformal_scale), np.log(scene.conformal_scale(result.edges))
+        centred = [values - values.mean(axis=1, keepdims=True) for values in (found, truth)]
+        assert np.corrcoef(centred[0].ravel(), centred[1].ravel())[0, 1] > 0.995
 
 
 def test_bad_input_is_named() -> None:
