@@ -7,6 +7,10 @@ The spline is a map S from the image plane to 3D that minimises
 over the bounding box of the x_i, widened on every side by a border in normalised image coordinates. Number of control
 points, bending and border are those of the code published with the isometric methods (Parashar, Pizarro, Bartoli,
 PAMI 2018), so that figures compare; the integral is in normalised image coordinates as there.
+
+The data term is a sum over points and not a mean, and the integral is not divided by the area: few points on a curved
+surface are smoothed more than many. On 100 points of spherical caps this alone costs 0.8 degrees (35-degree caps) and
+1.6 degrees (55-degree caps) for the exact truth, most of it at the border; `Evaluation.shape_floor_deg` reports it.
 """
 
 from __future__ import annotations
