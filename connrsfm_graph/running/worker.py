@@ -37,5 +37,5 @@ if __name__ == "__main__":
     os.dup2(2, 1)  # whatever prints must not disturb the answers
     try:
         serve(sys.stdin.buffer, answers)
-    except (EOFError, BrokenPipeError):  # whoever asked is gone
+    except (EOFError, BrokenPipeError, pickle.UnpicklingError):  # whoever asked is gone
         os._exit(1)

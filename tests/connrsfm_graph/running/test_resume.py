@@ -42,11 +42,13 @@ def test_kills_lose_nothing(work, tmp_path, workers):
     while kills < KILLS // 2:
         # So many files more, and then some: anywhere between the start and the end, however fast the machine.
         files = len(list(left.glob("*"))) + rng.integers(0, 4)
-        running = subprocess.Popen(resume, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        with (tmp_path / "log").open("w") as log:
+            running = subprocess.Popen(resume, stdout=log, stderr=log)
         while running.poll() is None and len(list(left.glob("*"))) < files:
             time.sleep(0.01)
         time.sleep(rng.uniform(0.0, 0.3))
         if running.poll() is not None:
+            assert running.returncode == 0, (tmp_path / "log").read_text()
             assert (out / "result.npz").read_bytes() == wanted
             (out / "result.npz").unlink()
             continue
