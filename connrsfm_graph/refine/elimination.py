@@ -39,6 +39,8 @@ class NormalEquations:
     """(E,) h."""
     unit: float
     """Inverse standard deviation of the mean log length."""
+    length_weight: np.ndarray
+    """(E,) weight of every log length's own prior."""
 
 
 @njit(cache=True, inline="always")
@@ -109,7 +111,7 @@ class Factorised:
         self.envelope = envelope
         self.ends = envelope.unknown[edges]
         damping = np.broadcast_to(np.asarray(damping, dtype=float), (len(equations.matrix),))
-        self.diagonal = equations.weight.sum(axis=0) * (1.0 + damping.max())
+        self.diagonal = (equations.weight.sum(axis=0) + equations.length_weight) * (1.0 + damping.max())
         self.factor = equations.matrix.copy()
         fine = np.empty(len(self.factor), dtype=bool)
         over_views(factor_kernel, len(fine), self.factor, damping, envelope.first, envelope.start, fine)

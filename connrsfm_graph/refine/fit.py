@@ -70,13 +70,15 @@ class Task:
         image = self.completed.image
         return float(np.median(np.linalg.norm(image[:, near[:, 0]] - image[:, near[:, 1]], axis=-1)))
 
-    def measurements(self, noise: Noise, declared: bool = True) -> Measurements:
+    def measurements(self, noise: Noise, conformal: bool, declared: bool = True) -> Measurements:
         """Measurements under given noise levels, with or without what is known of views declared isometric."""
-        config = self.config
+        config, start = self.config, start_shape(self.completed, self.mesh)
         return Measurements(
             image=self.completed.image,
             image_weight=noise.image_weight(self.seen, self.completed.deviation),
-            log_depth=start_shape(self.completed, self.mesh).log_depth,
+            log_depth=start.log_depth,
+            log_length=start.log_length,
+            log_length_weight=np.full(len(start.log_length), 0.0 if conformal else noise.prior),
             length_weight=np.full((len(self.seen), len(self.mesh.edges)), 1.0 / noise.length),
             factor_weight=np.where(self.declared & declared, _DECLARED_FACTOR, _FACTOR),
             mesh=self.mesh,
@@ -157,7 +159,7 @@ def _misfit(found: Fit) -> float:
 
 def fit_isometric(task: Task, noise: Noise) -> Fit:
     """Isometric fit from the start; views that cost more than others try other starts until none gains."""
-    measurements = task.measurements(noise)
+    measurements = task.measurements(noise, conformal=False)
     shape, history = _minimise(task, measurements, start_shape(task.completed, task.mesh))
     factor, per_edge = _SUSPECT
     for _ in range(_RESTARTS):
@@ -178,7 +180,7 @@ def fit_conformal(task: Task, noise: Noise) -> Fit:
 
     Views declared isometric are held to it only in the end: on the way it would keep wrong shapes from turning right.
     """
-    measurements = task.measurements(noise, declared=False)
+    measurements = task.measurements(noise, conformal=True, declared=False)
     shape, history = _restarted(task, measurements, start_shape(task.completed, task.mesh, conformal=True))
     (F, P), E = shape.log_depth.shape, len(shape.log_length)
     if 2.0 * history[-1] > _DOUBT * max(F * E - 2 * F * P - E, 1):
@@ -187,7 +189,7 @@ def fit_conformal(task: Task, noise: Noise) -> Fit:
         if more[-1] < history[-1]:
             shape, history = second, history + more
     shape, ambiguity = resolve(shape, measurements.image, task.mesh, task.declared)
-    measurements = task.measurements(noise)
+    measurements = task.measurements(noise, conformal=True)
     shape, more = _minimise(task, measurements, shape)
     history += more
     alternative = None
@@ -250,7 +252,7 @@ def _looks_like_noise(task: Task, found: Fit) -> bool:
 
 
 def _refitted(task: Task, found: Fit, noise: Noise) -> Fit:
-    measurements = task.measurements(noise)
+    measurements = task.measurements(noise, conformal=found.conformal)
     shape, history = _minimise(task, measurements, found.shape)
     return replace(found, measurements=measurements, shape=shape, noise=noise, history=found.history + history)
 

@@ -143,6 +143,8 @@ def _fitted(
         image=image,
         image_weight=fit.noise.image_weight(seen, deviation),
         log_depth=start.log_depth,
+        log_length=start.log_length,
+        log_length_weight=fit.measurements.log_length_weight,
         length_weight=np.full((B, E), 1.0 / fit.noise.length),
         factor_weight=fit.measurements.factor_weight[nearest],
         mesh=fit.measurements.mesh,

@@ -17,8 +17,13 @@ _LEAST_IMAGE = 1e-4
 """Smallest image noise, relative to the median image length of a mesh edge."""
 _OVERESTIMATED = 0.7
 """Corrections below this part of the assumed image noise show that it was assumed too large."""
+_SURE = 0.25
+"""Part of the first estimate of the image noise below which it is never lowered: corrections shrink with the noise that
+is assumed, so they alone would take it to nothing."""
 _HUBER = (0.25, 2.0, 1.0)
 """Robust threshold of the length residuals: at least, in units of their own robust standard deviation, at most."""
+_PRIOR = 8.0
+"""For the shared log lengths, before the views have shown how well they agree about them."""
 _RELEASE = 10.0
 """After the first fit an interpolated image point is held by so much less than its uncertainty says."""
 _SETTLED = 0.1
@@ -38,6 +43,10 @@ class Noise:
     """Standard deviation of a log length in one view."""
     spacing: float
     """Median image length of a mesh edge."""
+    least: float
+    """Smallest image noise that may be assumed."""
+    prior: float = _PRIOR
+    """Inverse standard deviation of the shared log lengths about their start, in an isometric model."""
     huber: float = _HUBER[2]
     """Length residuals count linearly beyond so many standard deviations."""
     release: float = 1.0
@@ -46,7 +55,8 @@ class Noise:
     @staticmethod
     def start(image: float, length: float, spacing: float) -> Noise:
         """For an estimate of the image noise, NaN where there is none."""
-        return Noise(max(image if np.isfinite(image) else 0.0, _LEAST_IMAGE * spacing), length, spacing)
+        image = max(image if np.isfinite(image) else 0.0, _LEAST_IMAGE * spacing)
+        return Noise(image, length, spacing, max(_SURE * image, _LEAST_IMAGE * spacing))
 
     def image_weight(self, seen: np.ndarray, deviation: np.ndarray) -> np.ndarray:
         """(F, P) inverse standard deviations of seen and interpolated image points."""
@@ -60,17 +70,21 @@ class Noise:
         shown = float(np.sqrt((correction**2).mean()))
         if shown >= _OVERESTIMATED * self.image:
             return self
-        return replace(self, image=max(shown, _LEAST_IMAGE * self.spacing))
+        return replace(self, image=max(shown, self.least))
 
     def halved_length(self) -> Noise:
         """With half the length noise."""
         return replace(self, length=0.5 * self.length)
 
     def after_fit(self, residual: np.ndarray) -> Noise:
-        """With the robust threshold that length residuals show, and interpolated points released."""
+        """With the robust threshold that length residuals show, and interpolated points released.
+
+        Where residuals are smaller than was assumed, so is all that the lengths' prior may add to the cost.
+        """
         least, factor, most = _HUBER
-        huber = float(np.clip(factor * 1.4826 * np.median(np.abs(residual)) / self.length, least, most))
-        return replace(self, huber=huber, release=_RELEASE)
+        shown = 1.4826 * float(np.median(np.abs(residual))) / self.length
+        huber = float(np.clip(factor * shown, least, most))
+        return replace(self, huber=huber, prior=_PRIOR * min(1.0, shown), release=_RELEASE)
 
     def settled(self, last: Noise) -> bool:
         """Whether another fit would change little."""

@@ -75,6 +75,10 @@ class Measurements:
     """(F, P) inverse standard deviation of the image points."""
     log_depth: np.ndarray
     """(F, P) log depths of the start, about which those of the shape may drift."""
+    log_length: np.ndarray
+    """(E,) log lengths of the start, likewise; it keeps a part that hardly moves from coming off the surface."""
+    log_length_weight: np.ndarray
+    """(E,) their inverse standard deviation."""
     length_weight: np.ndarray
     """(F, E) inverse standard deviation of the log lengths."""
     factor_weight: np.ndarray
@@ -153,14 +157,17 @@ def linearise(
     residual, weight = np.empty((F, E)), np.empty((F, E))
     arguments = _arguments(measurements, shape, lagged)
     over_views(linearise_kernel, F, *arguments, envelope, matrix, gradient, border, residual, weight)
-    unit = measurements.weights.unit
+    unit, prior = measurements.weights.unit, measurements.log_length_weight**2
     equations = NormalEquations(
         matrix=matrix,
         gradient=gradient,
         border=border,
         weight=weight,
         unit=unit,
-        length_gradient=unit**2 * shape.log_length.mean() / E - (weight * residual).sum(axis=0),
+        length_weight=prior,
+        length_gradient=unit**2 * shape.log_length.mean() / E
+        + prior * (shape.log_length - measurements.log_length)
+        - (weight * residual).sum(axis=0),
     )
     return equations, residual
 
@@ -207,15 +214,15 @@ def minimise(measurements: Measurements, shape: Shape, iterations: int, toleranc
     envelope = measurements.envelope(shape.log_factor.size > 0)
     damping, smallest, largest = _DAMPING
     lagged = lag(measurements, shape)
-    history = [_total(measurements, shape, lagged)]
+    history = [total_cost(measurements, shape, lagged)]
     for _ in range(iterations):
-        before = _total(measurements, shape, lagged)
+        before = total_cost(measurements, shape, lagged)
         equations, _ = linearise(measurements, shape, lagged, envelope)
         while damping <= largest:
             try:
                 factorised = Factorised(equations, envelope, measurements.mesh.edges, damping)
                 trial = moved(shape, envelope, *factorised.step(_INNER_TOLERANCE))
-                after = _total(measurements, trial, lagged)
+                after = total_cost(measurements, trial, lagged)
             except ComputationError:
                 after = np.inf
             if after <= before:
@@ -259,7 +266,9 @@ def fit_views(measurements: Measurements, shape: Shape, iterations: int, toleran
     return shape, costs(measurements, shape, lag(measurements, shape))
 
 
-def _total(measurements: Measurements, shape: Shape, lagged: Lagged) -> float:
+def total_cost(measurements: Measurements, shape: Shape, lagged: Lagged) -> float:
+    """Cost of all views, and of the lengths' own priors."""
     with np.errstate(over="ignore", invalid="ignore"):
         total = float(costs(measurements, shape, lagged).sum())
-    return total + 0.5 * (measurements.weights.unit * float(shape.log_length.mean())) ** 2
+    drift = measurements.log_length_weight * (shape.log_length - measurements.log_length)
+    return total + 0.5 * (measurements.weights.unit * float(shape.log_length.mean())) ** 2 + 0.5 * float(drift @ drift)

@@ -104,6 +104,8 @@ def from_lengths(start: View, keyframes: list[View], image_sigma: float, length_
         image=np.tile(start.image, (len(depths), 1, 1)),
         image_weight=np.full(depths.shape, 1.0 / image_sigma),
         log_depth=depths,
+        log_length=log_length(mesh.edges),
+        log_length_weight=np.zeros(len(mesh.edges)),
         length_weight=np.tile(weight, (len(depths), 1)),
         factor_weight=np.ones(len(depths)),
         mesh=mesh,

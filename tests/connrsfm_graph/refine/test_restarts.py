@@ -32,7 +32,7 @@ def test_a_part_taken_for_its_mirror_image_is_turned_back() -> None:
     scene = arcs_from_afar()
     seen = scene.tracks.visible
     task = Task.of(complete(scene.image, seen, scene.log_depth), seen, RefineConfig())
-    measurements = task.measurements(Noise.start(1e-5, 0.01, task.spacing()))
+    measurements = task.measurements(Noise.start(1e-5, 0.01, task.spacing()), conformal=False)
     true, _ = minimise(measurements, start_shape(task.completed, task.mesh), 30, 1e-4)
 
     # One half of view 2 is reflected about the line through its middle.
