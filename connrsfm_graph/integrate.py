@@ -23,7 +23,7 @@ from scipy.spatial import Delaunay
 
 from connrsfm_graph.errors import ComputationError, InputError
 from connrsfm_graph.problem import Problem, State
-from connrsfm_graph.surface_spline import SurfaceSpline, choose_bending
+from connrsfm_graph.surface_spline import SurfaceSpline, choose_bending, solve_all
 from connrsfm_graph.warps.basis import U, V
 from factors.depth_gradient import depth_graph, solve_depth
 
@@ -103,10 +103,12 @@ def integrate(
             )
         )
     bending = choose_bending(systems) if config.bending is None else config.bending
+    solve_all(systems, bending)
     for _ in range(3 if np.isfinite(config.huber) else 0):
         spread = 1.4826 * np.median(np.concatenate([system.residual_norms(bending) for system in systems]))
         for system in systems:
             system.reweight(config.huber * spread, bending)
+        solve_all(systems, bending)
     log_depth = np.zeros(problem.visible.shape)
     first, second = np.zeros((*log_depth.shape, 2)), np.zeros((*log_depth.shape, 3))
     for j, system in enumerate(systems):

@@ -7,6 +7,7 @@ from functools import cache
 import numpy as np
 from scipy.linalg import cho_solve, cholesky, eigh, solve_triangular
 
+from connrsfm_graph.threads import mapped
 from connrsfm_graph.warps.basis import UU, UV, VALUE, VV, SplineGrid, U, V
 from factors.surface import Camera
 
@@ -142,16 +143,23 @@ def terms_of_depth(
     ]
     if bending is None:
         bending = choose_bending(splines)
+    solve_all(splines, bending)
     first, second = np.zeros((*known.shape, 2)), np.zeros((*known.shape, 3))
     for j, (spline, seen) in enumerate(zip(splines, known, strict=True)):
         _, first[j, seen], second[j, seen] = spline.surface(image[j, seen], bending)
     return first, second, bending
 
 
+def solve_all(systems: list[SurfaceSpline], bending: float) -> None:
+    """Solve for the control points of all images, in threads; the splines keep them."""
+    for _ in mapped(lambda system: system.control(bending), systems):
+        pass
+
+
 def choose_bending(systems: list[SurfaceSpline]) -> float:
     """Bending weight of least generalised cross-validation score over up to `SCORED` images spread over all."""
     some = np.unique(np.linspace(0, len(systems) - 1, min(len(systems), SCORED)).round().astype(int))
-    scores = [systems[j].score(SMOOTHINGS) for j in some]
+    scores = list(mapped(lambda j: systems[j].score(SMOOTHINGS), some))
     rss = sum(score[0] for score in scores)
     parameters = sum(score[1] for score in scores)
     size = sum(score[2] for score in scores)
