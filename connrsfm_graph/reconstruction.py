@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import platform
+import re
 import sys
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields, replace
 from importlib import metadata
 from pathlib import Path
@@ -293,6 +295,11 @@ def peak_memory_mib() -> float:
     """Largest resident memory of this process so far, in MiB; NaN on systems that do not tell."""
     if sys.platform == "win32":
         return float("nan")
+    with suppress(OSError):
+        # On Linux `getrusage` also counts what the process was before it became this program.
+        status = Path("/proc/self/status").read_text(encoding="ascii")
+        if (match := re.search(r"VmHWM:\s*(\d+) kB", status)) is not None:
+            return int(match[1]) / 2**10
     import resource
 
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from dataclasses import fields
 from pathlib import Path
 
@@ -158,3 +160,11 @@ def test_bad_record_is_named(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "run.json").write_text(text)
     with pytest.raises(InputError, match=message):
         RunRecord.load(tmp_path)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems count the parent, too")
+def test_the_peak_memory_is_that_of_this_program_not_of_its_parent():
+    ballast = np.ones(40_000_000)  # 305 MiB
+    code = "from connrsfm_graph.reconstruction import peak_memory_mib as peak; print(peak())"
+    shown = float(subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout)
+    assert 10 < shown < peak_memory_mib() - ballast.nbytes / 2**20
