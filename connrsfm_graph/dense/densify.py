@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +20,7 @@ from connrsfm_graph.export.ply import write_ply
 from connrsfm_graph.files import folder_written_beside
 from connrsfm_graph.reconstruction import Reconstruction
 from connrsfm_graph.report.mesh import triangles
-from connrsfm_graph.tracks.images import ImageSequence, Source
+from connrsfm_graph.tracks.images import Source, images_of
 
 FEWEST_POINTS = 10
 """Images with fewer sparse points have no dense surface."""
@@ -73,7 +73,7 @@ def densify(
         writer = _Writer(folder, scale, fitting)
         skipped, warnings = [], list(choice.warnings)
         size = (0, 0)
-        for f, image in enumerate(_images_of(reconstruction, images)):
+        for f, image in enumerate(images_of(images, reconstruction.image_names, reconstruction.n_frames)):
             points, name = sparse[f], reconstruction.frame_name(f)
             if f == 0:
                 size = image.shape[1], image.shape[0]
@@ -170,26 +170,6 @@ def _problem(points: SparsePoints) -> str | None:
     if np.ptp(points.pixels, axis=0).min() < NARROWEST or not len(triangles(points.pixels)):
         return "points on a line"
     return None
-
-
-def _images_of(reconstruction: Reconstruction, source: Source) -> Iterator[np.ndarray]:
-    """The image of every frame in order; where there are more images than frames, those with the frames' names.
-
-    Raises:
-        InputError: the images are not as many as the frames, nor are the frames' names among them.
-    """
-    sequence, names, wanted = ImageSequence(source), reconstruction.image_names, reconstruction.n_frames
-    by_name = names is not None and len(sequence) != wanted
-    found = 0
-    for name, image in sequence:
-        if by_name and (found == wanted or name != reconstruction.frame_name(found)):
-            continue
-        found += 1
-        if found <= wanted:
-            yield image
-    if found != wanted:
-        sought = f"{wanted} images named as in the result" if by_name else f"{wanted} images"
-        raise InputError(f"{source}: holds {found}, expected {sought}, one per frame")
 
 
 def _check_inside(reconstruction: Reconstruction, f: int, size: tuple[int, int], source: Source) -> None:

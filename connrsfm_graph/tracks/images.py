@@ -95,7 +95,7 @@ class ImageSequence:
             yield _frame_name(self._video, number), image
 
 
-def images_of(source: Source, names: Sequence[str] | None, n_frames: int) -> Iterator[np.ndarray]:
+def images_of(source: Source, names: Sequence[str] | np.ndarray | None, n_frames: int) -> Iterator[np.ndarray]:
     """The images (H, W, 3) uint8 RGB that tracks or a result belong to, in their order, one at a time.
 
     Args:
@@ -104,16 +104,27 @@ def images_of(source: Source, names: Sequence[str] | None, n_frames: int) -> Ite
         n_frames: how many are wanted. Where names are unknown to `source`, it must hold just so many.
 
     Raises:
-        InputError: neither names nor number fit, or what `ImageSequence` raises.
+        InputError: neither names nor number fit, at once or, for a video whose header is wrong, in the end; or what
+            `ImageSequence` raises.
     """
     sequence = ImageSequence(source)
     wanted = set() if names is None else {str(name) for name in names}
     if wanted and wanted.issubset(sequence.names()):
-        return (image for name, image in sequence if name in wanted)
+        return _counted((image for name, image in sequence if name in wanted), n_frames, source)
     if len(sequence) != n_frames:
         known = "" if not wanted else f" or some named like {min(wanted)}"
         raise InputError(f"{source}: holds {len(sequence)} images, expected {n_frames}{known}")
-    return (image for _, image in sequence)
+    return _counted((image for _, image in sequence), n_frames, source)
+
+
+def _counted(images: Iterator[np.ndarray], wanted: int, source: Source) -> Iterator[np.ndarray]:
+    """The images; an error in the end where they were not so many, as a video's header may have promised."""
+    number = 0
+    for image in images:
+        number += 1
+        yield image
+    if number != wanted:
+        raise InputError(f"{source}: held {number} of the {wanted} images expected")
 
 
 def _frame_name(video: Path, number: int) -> str:

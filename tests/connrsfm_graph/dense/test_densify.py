@@ -111,14 +111,14 @@ def test_images_are_found_by_name_among_more(tmp_path: Path) -> None:
     true = replace(sheet(n_frames=2), image_names=np.array(["001.png", "004.png"]))
     index = densify(true, folder, tmp_path, "spline")
     assert [frame.name for frame in index.frames] == ["001.png", "004.png"]
-    with pytest.raises(InputError, match="holds 1, expected 2 images named as in the result"):
+    with pytest.raises(InputError, match=r"holds 5 images, expected 2 or some named like 001\.png"):
         densify(replace(true, image_names=np.array(["001.png", "007.png"])), folder, tmp_path, "spline")
 
 
 @pytest.mark.parametrize(
     ("spoil", "told"),
     [
-        (lambda folder: (folder / "002.png").unlink(), "holds 2, expected 3 images"),
+        (lambda folder: (folder / "002.png").unlink(), "holds 2 images, expected 3"),
         (lambda folder: (folder / "001.png").write_bytes(b"no image"), "001.png: cannot be read as an image"),
         (lambda folder: (folder / "001.png").write_bytes((folder / "001.png").read_bytes()[:200]), "001.png"),
         (lambda folder: [file.unlink() for file in folder.iterdir()], "holds no images"),
