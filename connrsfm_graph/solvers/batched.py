@@ -63,7 +63,26 @@ def _point_cost(model, frame, log_scale, data, weight, edges, kappa, precision, 
 
 
 @njit(cache=True)
-def _linearise_point(
+def pair_scratch():
+    """Room for the kernel, the rows and the Jacobian of a pair."""
+    return pair_workspace(), np.empty(ROWS), np.empty((ROWS, COLUMNS))
+
+
+@njit(cache=True)
+def point_equations(F, E, blocks, n):
+    """Room for the normal equations of a point, see `linearise_point`."""
+    return (
+        np.empty((F, n, n)),
+        np.empty((blocks, n, n)),
+        np.empty((F, n)),
+        np.empty((E, 2 * n)),
+        np.empty(E),
+        np.empty(E),
+    )
+
+
+@njit(cache=True)
+def linearise_point(
     model, frame, log_scale, data, weight, edges, structure, columns, scaled, kappa, precision, huber, scratch, H
 ):
     """Normal equations of one point into H = (diagonal, lower, gradient, cross, scale, scale_gradient)."""
@@ -126,7 +145,7 @@ def _linearise_point(
 
 
 @njit(cache=True)
-def _solve_point(weight, edges, structure, scaled, damping, H, diagonal, lower, step, scale_step):
+def solve_point(weight, edges, structure, scaled, damping, H, diagonal, lower, step, scale_step):
     """Solve (H + damping I) step = -gradient; False where that is not positive definite."""
     H_diagonal, H_lower, gradient, cross, scale, scale_gradient = H
     F, n = gradient.shape
@@ -180,23 +199,15 @@ def _minimise_point(
     """Levenberg-Marquardt of one point in place; returns (cost, accepted steps, solvable)."""
     max_iterations, tolerance, damping = limits
     F, E, n = len(frame), len(edges), len(columns)
-    scratch = (pair_workspace(), np.empty(ROWS), np.empty((ROWS, COLUMNS)))
-    blocks = len(structure.row)
-    H = (
-        np.empty((F, n, n)),
-        np.empty((blocks, n, n)),
-        np.empty((F, n)),
-        np.empty((E, 2 * n)),
-        np.empty(E),
-        np.empty(E),
-    )
-    diagonal, lower = np.empty((F, n, n)), np.empty((blocks, n, n))
+    scratch = pair_scratch()
+    H = point_equations(F, E, len(structure.row), n)
+    diagonal, lower = np.empty_like(H[0]), np.empty_like(H[1])
     step, scale_step = np.zeros((F, n)), np.zeros(E)
     trial, trial_scale = frame.copy(), log_scale.copy()
     cost = _point_cost(model, frame, log_scale, data, weight, edges, kappa, precision, huber, scratch)
     iteration = 0
     while iteration < max_iterations and (single or cost > VANISHING_COST):
-        _linearise_point(
+        linearise_point(
             model,
             frame,
             log_scale,
@@ -213,7 +224,7 @@ def _minimise_point(
             H,
         )
         while True:
-            solved = _solve_point(weight, edges, structure, scaled, damping, H, diagonal, lower, step, scale_step)
+            solved = solve_point(weight, edges, structure, scaled, damping, H, diagonal, lower, step, scale_step)
             if single and not solved:
                 return cost, iteration, False
             if solved:
