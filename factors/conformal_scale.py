@@ -3,6 +3,8 @@
 Eleven of the 21 rows depend on the scale: in rho = lambda beta_b / beta_a the four upper extrinsic rows are
 a / rho - b, the four lower ones c rho - d, and the three metric rows e - m rho^2. Their weighted sum of squares is
 stationary where a polynomial of degree six vanishes; the positive root of least cost is the global minimum.
+Between neighbouring roots of its derivative a polynomial is monotone, so that the roots of the derivatives, from the
+last one on, bracket all roots.
 """
 
 from __future__ import annotations
@@ -13,6 +15,71 @@ from numba import njit, prange
 from factors.conformal_pair import COLUMNS, pair_kernel, pair_workspace
 from factors.noise import ROWS, PairNoise
 from factors.surface import PERSPECTIVE, Camera
+
+_MOST_STEPS = 100
+"""Of Newton's method or bisection, towards one root; few are needed."""
+
+
+@njit(cache=True, inline="always")
+def _value_and_slope(p, degree, x):
+    """Of the polynomial sum_k p[k] x^k."""
+    value, slope = p[degree], 0.0
+    for k in range(degree - 1, -1, -1):
+        slope = slope * x + value
+        value = value * x + p[k]
+    return value, slope
+
+
+@njit(cache=True, inline="always")
+def _root_between(p, degree, low, high):
+    """The root of a polynomial that is monotone from `low` to `high` and changes its sign there."""
+    rising = _value_and_slope(p, degree, high)[0] > 0.0
+    x = 0.5 * (low + high)
+    for _ in range(_MOST_STEPS):
+        value, slope = _value_and_slope(p, degree, x)
+        if (value > 0.0) == rising:
+            high = x
+        else:
+            low = x
+        last = x
+        if slope != 0.0:
+            x -= value / slope
+        if not low < x < high:
+            x = 0.5 * (low + high)
+        if abs(x - last) <= 4e-16 * last:
+            break
+    return x
+
+
+@njit(cache=True)
+def positive_roots(p):
+    """Positive roots, ascending, of the polynomial sum_k p[k] x^k where it changes its sign; p[-1] is not zero."""
+    n = len(p) - 1
+    derivatives, roots = np.empty((n + 1, n + 1)), np.zeros(n + 2)
+    bound = 0.0  # Fujiwara's, on the size of all roots of the polynomial and with it (Gauss, Lucas) of its derivatives
+    for k in range(n):
+        derivatives[0, k] = p[k]
+        if p[k] != 0.0:
+            bound = max(bound, 2.0 * abs(p[k] / p[n]) ** (1.0 / (n - k)))
+    derivatives[0, n] = p[n]
+    for order in range(1, n):
+        for k in range(n - order + 1):
+            derivatives[order, k] = (k + 1) * derivatives[order - 1, k + 1]
+    count = 0
+    roots[1] = bound  # the roots of a derivative stand between 0 and the bound
+    for order in range(n - 1, -1, -1):
+        q, degree = derivatives[order], n - order
+        low, at_low, found = 0.0, q[0], 0
+        for k in range(1, count + 2):
+            high = roots[k]
+            at_high = _value_and_slope(q, degree, high)[0]
+            if (at_low < 0.0 < at_high) or (at_high < 0.0 < at_low):
+                found += 1
+                roots[found] = _root_between(q, degree, low, high)
+            low, at_low = high, at_high
+        count = found
+        roots[count + 1] = bound
+    return roots[1 : count + 1]
 
 
 @njit(cache=True)
@@ -41,14 +108,16 @@ def scale_kernel(data, ya, yb, kappa, precision, workspace, r, J):
         return np.nan
     if not (A > 0.0 or C > 0.0):
         return 0.5 * np.log(F / E) if F > 0.0 else np.nan
+    slope = np.array([-A, B, 0.0, -D, C - 2.0 * F, 0.0, 2.0 * E])  # half that of the cost, times rho^3
+    degree = 6
+    while slope[degree] == 0.0:
+        degree -= 1
     best, best_cost = np.nan, np.inf
-    for root in np.roots(np.array([2.0 * E, 0.0, C - 2.0 * F, -D, 0.0, B, -A]) + 0.0j):
-        rho = root.real
-        if rho > 0.0 and abs(root.imag) < 1e-7 * abs(root):
-            rho2 = rho * rho
-            cost = A / rho2 - 2.0 * B / rho + (C - 2.0 * F) * rho2 - 2.0 * D * rho + E * rho2 * rho2
-            if cost < best_cost:
-                best, best_cost = rho, cost
+    for rho in positive_roots(slope[: degree + 1]):
+        rho2 = rho * rho
+        cost = A / rho2 - 2.0 * B / rho + (C - 2.0 * F) * rho2 - 2.0 * D * rho + E * rho2 * rho2
+        if cost < best_cost:
+            best, best_cost = rho, cost
     return np.log(best)
 
 

@@ -9,7 +9,7 @@ import pytest
 from connrsfm_graph.synthetic import isometric_bending, spheres
 from factors.adapter import FactorError
 from factors.conformal_pair import COLUMNS, conformal_pair_factor, residuals
-from factors.conformal_scale import closed_form_log_rho
+from factors.conformal_scale import closed_form_log_rho, positive_roots
 from factors.isometric_pair import isometric_pair_factor
 from factors.keys import key
 from factors.noise import EXTRINSIC_ROWS, INTRINSIC_ROWS, METRIC_ROWS, ROWS, PairNoise
@@ -54,6 +54,16 @@ def test_closed_form_scale_is_exact():
     for noise in (PairNoise(), PairNoise(intrinsic=np.inf, extrinsic=np.inf), PairNoise(metric=np.inf)):
         found = closed_form_log_rho(point_major[0], np.ones(data.shape[1::-1]), point_major[1], EDGES, noise)
         assert found == pytest.approx(log_rho.T, abs=1e-9)
+
+
+@pytest.mark.parametrize("degree", range(1, 7))
+def test_positive_roots_are_all_where_the_sign_changes(degree):
+    rng = np.random.default_rng(degree)
+    for _ in range(200):
+        p = rng.normal(size=degree + 1) * 10.0 ** rng.uniform(-3, 3, size=degree + 1)
+        roots = np.roots(p[::-1])
+        expected = np.sort(roots[(roots.real > 0) & (np.abs(roots.imag) < 1e-9 * np.abs(roots))].real)
+        assert positive_roots(p) == pytest.approx(expected, rel=1e-6)
 
 
 def _random_pair(rng):
