@@ -30,7 +30,9 @@ def over_views(kernel: Callable[..., None], n_views: int, *arguments: Any) -> No
         kernel(0, n_views, *arguments)
         return
     bounds = [n_views * n // threads for n in range(threads + 1)]
-    tasks = [_pool(threads).submit(kernel, a, b, *arguments) for a, b in pairwise(bounds)]
+    own, *others = pairwise(bounds)
+    tasks = [_pool(threads).submit(kernel, a, b, *arguments) for a, b in others]
+    kernel(*own, *arguments)
     for task in tasks:
         task.result()
 

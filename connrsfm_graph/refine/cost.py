@@ -72,7 +72,7 @@ def hinge_stencils(length, hinge_edges, coefficients):
 
 
 @njit(cache=True)
-def _view_cost(X, f, drift, offset, correction, image_weight, length_weight, factor_weight, terms):
+def view_cost(X, f, drift, offset, correction, image_weight, length_weight, factor_weight, terms):
     """Half the robust weighted sum of squares of one view.
 
     Args:
@@ -114,11 +114,11 @@ def _view_cost(X, f, drift, offset, correction, image_weight, length_weight, fac
 
 
 @njit(cache=True)
-def _linearise_view(
+def linearise_view(
     X, f, drift, offset, correction, image_weight, length_weight, factor_weight, terms, envelope,
     matrix, gradient, border, residual, inverse_variance,
 ):  # fmt: skip
-    """Normal equations of one view; arguments before `envelope` as in `_view_cost`.
+    """Normal equations of one view; arguments before `envelope` as in `view_cost`.
 
     Args:
         envelope: storage of the matrix (see `envelope`).
@@ -204,9 +204,9 @@ def _add_row(matrix, row, gradient, at, J, n, w, r):
 
 @njit(cache=True, nogil=True)
 def cost_kernel(first, last, X, f, drift, offset, correction, image_weight, length_weight, factor_weight, terms, cost):
-    """Cost of views first to last - 1 into `cost` (F,); arguments as in `_view_cost`, with a dimension for views."""
+    """Cost of views first to last - 1 into `cost` (F,); arguments as in `view_cost`, with a dimension for views."""
     for v in range(first, last):
-        cost[v] = _view_cost(
+        cost[v] = view_cost(
             X[v], f[v], drift[v], offset[v], correction[v], image_weight[v], length_weight[v], factor_weight[v], terms
         )
 
@@ -216,9 +216,9 @@ def linearise_kernel(
     first, last, X, f, drift, offset, correction, image_weight, length_weight, factor_weight, terms, envelope,
     matrix, gradient, border, residual, inverse_variance,
 ):  # fmt: skip
-    """Normal equations of views first to last - 1; arguments as in `_linearise_view`, with a dimension for views."""
+    """Normal equations of views first to last - 1; arguments as in `linearise_view`, with a dimension for views."""
     for v in range(first, last):
-        _linearise_view(
+        linearise_view(
             X[v], f[v], drift[v], offset[v], correction[v], image_weight[v], length_weight[v], factor_weight[v], terms,
             envelope, matrix[v], gradient[v], border[v], residual[v], inverse_variance[v],
         )  # fmt: skip

@@ -35,7 +35,7 @@ def _triangle_normals(X, triangles, normal):
 
 
 @njit(cache=True, inline="always")
-def _solved(A, b):
+def solved(A, b):
     """A^-1 b in the place of b, by Cholesky in the place of A, symmetric and positive definite."""
     n = len(b)
     for r in range(n):
@@ -109,7 +109,7 @@ def _quadrics(X, triangles, edges, normal, axis, curvature):
     for i in range(P):
         for r in range(5):
             A[i, r, r] += QUADRIC_RIDGE
-        slope = _solved(A[i], b[i])
+        slope = solved(A[i], b[i])
         normal[i] -= slope[0] * axis[i, 0] + slope[1] * axis[i, 1]
         normal[i] /= np.sqrt(normal[i, 0] ** 2 + normal[i, 1] ** 2 + normal[i, 2] ** 2)
         size = max(scale[i], 1e-300)
@@ -119,7 +119,7 @@ def _quadrics(X, triangles, edges, normal, axis, curvature):
 
 
 @njit(cache=True)
-def _arc_offsets(X, triangles, edges, offset):
+def arc_offsets(X, edges, triangles, offset):
     """Log ratio of arc to chord of every edge of one view."""
     P = len(X)
     normal = np.empty((P, 3))
@@ -139,7 +139,7 @@ def _arc_offsets(X, triangles, edges, offset):
 def arc_offset_kernel(first, last, X, triangles, edges, offset):
     """Log ratio of arc to chord of every edge into `offset` (F, E), for views first to last - 1."""
     for v in range(first, last):
-        _arc_offsets(X[v], triangles, edges, offset[v])
+        arc_offsets(X[v], edges, triangles, offset[v])
 
 
 @njit(cache=True, nogil=True)

@@ -19,7 +19,7 @@ import numpy as np
 from numba import njit
 
 from connrsfm_graph.errors import ComputationError
-from connrsfm_graph.refine.envelope import Envelope, factor_kernel, solve_kernel, solve_many_kernel, substitute
+from connrsfm_graph.refine.envelope import Envelope, factor_kernel, solve_kernel, substitute
 from connrsfm_graph.threads import over_views
 
 
@@ -28,7 +28,7 @@ class NormalEquations:
     """Linearised cost of F views with n unknowns each and E shared lengths."""
 
     matrix: np.ndarray
-    """(F, N) lower triangles H_f inside the envelope."""
+    """(F, N) lower triangles H_f inside the envelope; overwritten by their factors (see `Factorised`)."""
     gradient: np.ndarray
     """(F, n) gradients g_f."""
     border: np.ndarray
@@ -79,7 +79,7 @@ def _gather_all(begin, end, border, weight, ends, x, out):
         _gather(border[f], weight[f], ends, x[f], out[f])
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "arcp", "nsz"})
+@njit(cache=True, nogil=True)
 def _schur_terms(begin, end, factor, first, start, border, weight, ends, v, out):
     """out_f = W_f' H_f^-1 W_f v for views begin to end - 1."""
     for f in range(begin, end):
@@ -92,17 +92,14 @@ def _schur_terms(begin, end, factor, first, start, border, weight, ends, v, out)
 class Factorised:
     """Damped normal equations with the views' matrices factored; solves and products with inverses."""
 
-    def __init__(
-        self, equations: NormalEquations, envelope: Envelope, edges: np.ndarray, damping: float | np.ndarray = 0.0
-    ):
+    def __init__(self, equations: NormalEquations, envelope: Envelope, edges: np.ndarray, damping: float = 0.0):
         """Factor.
 
         Args:
-            equations: the normal equations.
+            equations: the normal equations; the factors take the place of their matrix.
             envelope: storage of the views' matrices.
             edges: (E, 2) points of each length.
-            damping: Marquardt's: diagonals are multiplied by 1 + damping; one number, or (F,) one for each view (the
-                lengths then take the largest).
+            damping: Marquardt's: diagonals are multiplied by 1 + damping.
 
         Raises:
             ComputationError: a view's matrix is not positive definite.
@@ -110,19 +107,17 @@ class Factorised:
         self.equations = equations
         self.envelope = envelope
         self.ends = envelope.unknown[edges]
-        damping = np.broadcast_to(np.asarray(damping, dtype=float), (len(equations.matrix),))
-        self.diagonal = (equations.weight.sum(axis=0) + equations.length_weight) * (1.0 + damping.max())
-        self.factor = equations.matrix.copy()
+        self.diagonal = (equations.weight.sum(axis=0) + equations.length_weight) * (1.0 + damping)
+        self.factor = equations.matrix
         fine = np.empty(len(self.factor), dtype=bool)
         over_views(factor_kernel, len(fine), self.factor, damping, envelope.first, envelope.start, fine)
         if not fine.all():
             raise ComputationError("refinement: the normal equations of a view are not positive definite")
 
     def solve_views(self, x: np.ndarray) -> np.ndarray:
-        """H_f^-1 x_f for all views, shape (F, n), or (F, n, R) for several right-hand sides."""
+        """H_f^-1 x_f for all views, shape (F, n)."""
         x = x.copy()
-        kernel = solve_kernel if x.ndim == 2 else solve_many_kernel
-        over_views(kernel, len(x), self.factor, self.envelope.first, self.envelope.start, x)
+        over_views(solve_kernel, len(x), self.factor, self.envelope.first, self.envelope.start, x)
         return x
 
     def spread(self, v: np.ndarray) -> np.ndarray:

@@ -13,6 +13,8 @@ from numba import njit
 
 _TILE = 3
 """Rows that are factored at a time."""
+_SUMS = {"reassoc", "contract", "arcp", "nsz"}
+"""What compiled code may do to sums, so that they are vectorised."""
 
 
 class Envelope(NamedTuple):
@@ -145,18 +147,24 @@ def _below(row, at, s0, s1, s2, b0, b1, b2):
     row[at + 2] = (row[at + 2] - s2 - row[at] * b2[at] - row[at + 1] * b2[at + 1]) / b2[at + 2]
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "arcp", "nsz"})
+@njit(cache=True, nogil=True, fastmath=_SUMS)
+def factor_damped(A, damping, first, start):
+    """Multiply the diagonal of one view's matrix by 1 + damping and factor in place; false where that fails."""
+    for r in range(len(first)):
+        A[start[r + 1] - 1] *= 1.0 + damping
+    return _factor_view(A, first, start)
+
+
+@njit(cache=True, nogil=True)
 def factor_kernel(begin, end, matrix, damping, first, start, fine):
-    """Damp the diagonals and factor views begin to end - 1 in place; `fine` (F,) says whether that succeeded."""
+    """`factor_damped` of views begin to end - 1; `fine` (F,) says whether that succeeded."""
     for f in range(begin, end):
-        for r in range(len(first)):
-            matrix[f, start[r + 1] - 1] *= 1.0 + damping[f]
-        fine[f] = _factor_view(matrix[f], first, start)
+        fine[f] = factor_damped(matrix[f], damping, first, start)
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, nogil=True, fastmath=_SUMS)
 def substitute(L, first, start, x):
-    """Solve L L' y = x in place."""
+    """Solve L L' y = x in place, for one view."""
     n = len(first)
     for r in range(n):
         left = L[start[r] : start[r + 1] - 1]
@@ -169,32 +177,30 @@ def substitute(L, first, start, x):
             above[k] -= left[k] * s
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "arcp", "nsz"})
+@njit(cache=True, nogil=True, fastmath=_SUMS)
+def substitute_many(L, first, start, y):
+    """The same for several right-hand sides at once, y (n, R)."""
+    n, R = y.shape
+    for r in range(n):
+        row = y[r]
+        for c in range(first[r], r):
+            value, other = L[start[r] + c - first[r]], y[c]
+            for k in range(R):
+                row[k] -= value * other[k]
+        for k in range(R):
+            row[k] /= L[start[r + 1] - 1]
+    for r in range(n - 1, -1, -1):
+        row = y[r]
+        for k in range(R):
+            row[k] /= L[start[r + 1] - 1]
+        for c in range(first[r], r):
+            value, other = L[start[r] + c - first[r]], y[c]
+            for k in range(R):
+                other[k] -= value * row[k]
+
+
+@njit(cache=True, nogil=True)
 def solve_kernel(begin, end, factor, first, start, x):
     """x_f = H_f^-1 x_f in place for views begin to end - 1."""
     for f in range(begin, end):
         substitute(factor[f], first, start, x[f])
-
-
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "arcp", "nsz"})
-def solve_many_kernel(begin, end, factor, first, start, x):
-    """The same for several right-hand sides at once, x (F, n, R)."""
-    n, R = x.shape[1:]
-    for f in range(begin, end):
-        L, y = factor[f], x[f]
-        for r in range(n):
-            row = y[r]
-            for c in range(first[r], r):
-                value, other = L[start[r] + c - first[r]], y[c]
-                for k in range(R):
-                    row[k] -= value * other[k]
-            for k in range(R):
-                row[k] /= L[start[r + 1] - 1]
-        for r in range(n - 1, -1, -1):
-            row = y[r]
-            for k in range(R):
-                row[k] /= L[start[r + 1] - 1]
-            for c in range(first[r], r):
-                value, other = L[start[r] + c - first[r]], y[c]
-                for k in range(R):
-                    other[k] -= value * row[k]

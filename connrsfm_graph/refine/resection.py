@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
+
+from connrsfm_graph.refine.curvature import solved
+from connrsfm_graph.threads import over_views
 
 _ITERATIONS = 8
 _DAMPING = 1e-3
@@ -21,40 +25,71 @@ def moved_rigidly(points: np.ndarray, image: np.ndarray, seen: np.ndarray) -> np
         seen: (B, P) bool.
     """
     moved = points.copy()
-    for _ in range(_ITERATIONS):
-        residual, J = _linearised(moved, image, seen)
-        N = np.einsum("bpki,bpkj->bij", J, J)
-        N += (_DAMPING * np.einsum("bii->bi", N) + 1e-300)[:, None] * np.eye(6)
-        step = -np.linalg.solve(N, np.einsum("bpki,bpk->bi", J, residual)[..., None])[..., 0]
-        centre = moved.mean(axis=1, keepdims=True)
-        moved = centre + np.einsum("bij,bpj->bpi", _rotation(step[:, :3]), moved - centre) + step[:, None, 3:]
-        moved[(moved[..., 2] <= 0).any(axis=1)] = np.nan
-    better = np.nan_to_num(_error(moved, image, seen), nan=np.inf) < _error(points, image, seen)
-    return np.where(better[:, None, None], moved, points)
+    over_views(_move_kernel, len(points), points, image, seen, moved)
+    return moved
 
 
-def _linearised(points: np.ndarray, image: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals (B, P, 2) of the projections and their derivatives (B, P, 2, 6) by rotation vector and translation."""
-    x, y, z = np.moveaxis(np.nan_to_num(points, nan=1.0), -1, 0)
-    zero = np.zeros_like(x)
-    by_point = np.stack([np.stack([1 / z, zero, -x / z**2], -1), np.stack([zero, 1 / z, -y / z**2], -1)], axis=-2)
-    a, b, c = np.moveaxis(np.nan_to_num(points - points.mean(axis=1, keepdims=True)), -1, 0)
-    turn = np.stack([np.stack([zero, c, -b], -1), np.stack([-c, zero, a], -1), np.stack([b, -a, zero], -1)], axis=-2)
-    J = np.concatenate([by_point @ turn, by_point], axis=-1)
-    residual = np.stack([x / z, y / z], axis=-1) - image
-    return np.where(seen[..., None], residual, 0.0), np.where(seen[..., None, None], J, 0.0)
+@njit(cache=True, nogil=True)
+def _move_kernel(first, last, points, image, seen, moved):
+    """Move surfaces first to last - 1, which `moved` holds unmoved."""
+    for v in range(first, last):
+        X = moved[v]
+        for _ in range(_ITERATIONS):
+            _take_step(X, image[v], seen[v])
+            if not X[:, 2].min() > 0.0:
+                break
+        if not (X[:, 2].min() > 0.0 and _error(X, image[v], seen[v]) < _error(points[v], image[v], seen[v])):
+            X[:] = points[v]
 
 
-def _error(points: np.ndarray, image: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """(B,) sum of squares of the projections' residuals."""
-    return np.where(seen[..., None], (points[..., :2] / points[..., 2:] - image) ** 2, 0.0).sum(axis=(1, 2))
+@njit(cache=True, nogil=True)
+def _take_step(X, image, seen):
+    """Turn X (P, 3) about its centre and shift it: a Gauss-Newton step."""
+    P = len(X)
+    centre = np.zeros(3)
+    for i in range(P):
+        centre += X[i]
+    centre /= P
+    N, g, J = np.zeros((6, 6)), np.zeros(6), np.empty(6)
+    for i in range(P):
+        if not seen[i]:
+            continue
+        a, b, c = X[i] - centre
+        z = X[i, 2]
+        for axis in range(2):
+            # Derivatives by the point, then by the rotation vector: X + rotation x (X - centre) + shift.
+            J[3], J[4], J[5] = 0.0, 0.0, -X[i, axis] / z**2
+            J[3 + axis] = 1.0 / z
+            J[0], J[1], J[2] = b * J[5] - c * J[4], c * J[3] - a * J[5], a * J[4] - b * J[3]
+            residual = X[i, axis] / z - image[i, axis]
+            for r in range(6):
+                g[r] -= J[r] * residual
+                for s in range(6):
+                    N[r, s] += J[r] * J[s]
+    for r in range(6):
+        N[r, r] += _DAMPING * N[r, r] + 1e-300
+    step = solved(N, g)
+    R = _rotation(step[:3])
+    for i in range(P):
+        a, b, c = X[i] - centre
+        for r in range(3):
+            X[i, r] = centre[r] + R[r, 0] * a + R[r, 1] * b + R[r, 2] * c + step[3 + r]
 
 
-def _rotation(vector: np.ndarray) -> np.ndarray:
-    """(B, 3, 3) rotations by vectors (B, 3): Rodrigues' formula."""
-    angle = np.linalg.norm(vector, axis=1)[:, None, None]
-    a, b, c = vector.T
-    zero = np.zeros_like(a)
-    K = np.stack([np.stack([zero, -c, b], -1), np.stack([c, zero, -a], -1), np.stack([-b, a, zero], -1)], axis=-2)
-    small = np.maximum(angle, 1e-12)
-    return np.eye(3) + np.sin(small) / small * K + (1.0 - np.cos(small)) / small**2 * (K @ K)
+@njit(cache=True, nogil=True)
+def _error(X, image, seen):
+    """Sum of squares of the projections' residuals."""
+    total = 0.0
+    for i in range(len(X)):
+        if seen[i]:
+            total += (X[i, 0] / X[i, 2] - image[i, 0]) ** 2 + (X[i, 1] / X[i, 2] - image[i, 1]) ** 2
+    return total
+
+
+@njit(cache=True, nogil=True)
+def _rotation(vector):
+    """(3, 3) rotation by a vector (3,): Rodrigues' formula."""
+    a, b, c = vector
+    angle = max(np.sqrt(a * a + b * b + c * c), 1e-12)
+    K = np.array([[0.0, -c, b], [c, 0.0, -a], [-b, a, 0.0]])
+    return np.eye(3) + np.sin(angle) / angle * K + (1.0 - np.cos(angle)) / angle**2 * (K @ K)

@@ -13,6 +13,7 @@ from connrsfm_graph.refine.curvature import arc_offset_kernel
 from connrsfm_graph.refine.elimination import Factorised, NormalEquations
 from connrsfm_graph.refine.envelope import Envelope, make_envelope
 from connrsfm_graph.refine.mesh import Mesh
+from connrsfm_graph.refine.one_view import fit_views_kernel
 from connrsfm_graph.threads import over_views
 
 Progress = Callable[[str], None]
@@ -23,6 +24,8 @@ _EXACT = 1e-6
 """Mean squared length residual, in assumed variances, below which the data are exact and nothing is left to gain."""
 _INNER_TOLERANCE = 0.2
 """Relative accuracy of the conjugate gradients: what they leave the next iteration corrects, as it does curvature."""
+_OF_VIEWS = ("log_depth", "correction", "log_factor")
+"""Parts of a shape that belong to single views."""
 
 
 @dataclass(frozen=True)
@@ -49,20 +52,10 @@ class Shape:
 
     def replaced(self, index: np.ndarray, other: Shape) -> Shape:
         """The shape with some views taken from a shape of only these."""
-        parts = [array.copy() for array in (self.log_depth, self.correction, self.log_factor)]
-        for part, new in zip(parts, (other.log_depth, other.correction, other.log_factor), strict=True):
-            part[index] = new
-        return Shape(parts[0], parts[1], parts[2], self.log_length)
-
-    def with_views(self, chosen: np.ndarray, other: Shape) -> Shape:
-        """The shape with the chosen views (F,) bool taken from another one of the same lengths."""
-        keep = chosen[:, None]
-        return Shape(
-            np.where(keep, other.log_depth, self.log_depth),
-            np.where(keep[..., None], other.correction, self.correction),
-            np.where(keep, other.log_factor, self.log_factor),
-            self.log_length,
-        )
+        parts = {name: getattr(self, name).copy() for name in _OF_VIEWS}
+        for name, part in parts.items():
+            part[index] = getattr(other, name)
+        return replace(self, **parts)
 
 
 @dataclass(frozen=True)
@@ -127,10 +120,7 @@ def lag(measurements: Measurements, shape: Shape) -> Lagged:
 
     A conformal model compares chords: Moebius maps keep their ratios exactly, not those of arcs.
     """
-    mesh = measurements.mesh
-    stencils = np.zeros((len(mesh.hinges), 4))
-    if measurements.weights.bending > 0.0:
-        hinge_stencils(np.exp(shape.log_length), mesh.hinge_edges, stencils)
+    mesh, stencils = measurements.mesh, _stencils(measurements, shape)
     points = shape.points(measurements.image)
     offset = np.zeros((len(points), len(mesh.edges)))
     if shape.log_factor.size:
@@ -139,23 +129,35 @@ def lag(measurements: Measurements, shape: Shape) -> Lagged:
     return Lagged(offset, stencils)
 
 
+def _stencils(measurements: Measurements, shape: Shape) -> np.ndarray:
+    stencils = np.zeros((len(measurements.mesh.hinges), 4))
+    if measurements.weights.bending > 0.0:
+        hinge_stencils(np.exp(shape.log_length), measurements.mesh.hinge_edges, stencils)
+    return stencils
+
+
 def costs(measurements: Measurements, shape: Shape, lagged: Lagged) -> np.ndarray:
     """(F,) cost of every view: half the robust weighted sum of squares."""
     cost = np.empty(len(shape.log_depth))
-    over_views(cost_kernel, len(cost), *_arguments(measurements, shape, lagged), cost)
+    over_views(cost_kernel, len(cost), *kernel_arguments(measurements, shape, lagged), cost)
     return cost
 
 
 def linearise(
-    measurements: Measurements, shape: Shape, lagged: Lagged, envelope: Envelope
+    measurements: Measurements,
+    shape: Shape,
+    lagged: Lagged,
+    envelope: Envelope,
+    storage: np.ndarray | None = None,
 ) -> tuple[NormalEquations, np.ndarray]:
-    """Normal equations at a shape, and the length residuals (F, E)."""
+    """Normal equations at a shape, and the length residuals (F, E); `storage` is that of a matrix no longer needed."""
     F, _ = shape.log_depth.shape
     n, E = len(envelope.first), len(measurements.mesh.edges)
-    matrix, gradient = np.empty((F, envelope.start[-1])), np.empty((F, n))
+    matrix = np.empty((F, envelope.start[-1])) if storage is None else storage
+    gradient = np.empty((F, n))
     border = np.empty((F, E, 8 if shape.log_factor.size else 6))
     residual, weight = np.empty((F, E)), np.empty((F, E))
-    arguments = _arguments(measurements, shape, lagged)
+    arguments = kernel_arguments(measurements, shape, lagged)
     over_views(linearise_kernel, F, *arguments, envelope, matrix, gradient, border, residual, weight)
     unit, prior = measurements.weights.unit, measurements.log_length_weight**2
     equations = NormalEquations(
@@ -172,8 +174,8 @@ def linearise(
     return equations, residual
 
 
-def _arguments(measurements: Measurements, shape: Shape, lagged: Lagged) -> tuple:
-    mesh = measurements.mesh
+def kernel_arguments(measurements: Measurements, shape: Shape, lagged: Lagged) -> tuple:
+    """What the kernels of the cost ask for."""
     return (
         shape.points(measurements.image),
         shape.log_factor,
@@ -183,8 +185,13 @@ def _arguments(measurements: Measurements, shape: Shape, lagged: Lagged) -> tupl
         measurements.image_weight,
         measurements.length_weight,
         measurements.factor_weight,
-        Terms(mesh.edges, mesh.n_near, mesh.hinges, lagged.stencils, shape.log_length, measurements.weights),
+        _terms(measurements, shape, lagged.stencils),
     )
+
+
+def _terms(measurements: Measurements, shape: Shape, stencils: np.ndarray) -> Terms:
+    mesh = measurements.mesh
+    return Terms(mesh.edges, mesh.n_near, mesh.hinges, stencils, shape.log_length, measurements.weights)
 
 
 def moved(shape: Shape, envelope: Envelope, views: np.ndarray, lengths: np.ndarray | float) -> Shape:
@@ -215,10 +222,12 @@ def minimise(measurements: Measurements, shape: Shape, iterations: int, toleranc
     damping, smallest, largest = _DAMPING
     lagged = lag(measurements, shape)
     history = [total_cost(measurements, shape, lagged)]
+    storage = None
     for _ in range(iterations):
         before = total_cost(measurements, shape, lagged)
-        equations, _ = linearise(measurements, shape, lagged, envelope)
         while damping <= largest:
+            equations, _ = linearise(measurements, shape, lagged, envelope, storage)
+            storage = equations.matrix
             try:
                 factorised = Factorised(equations, envelope, measurements.mesh.edges, damping)
                 trial = moved(shape, envelope, *factorised.step(_INNER_TOLERANCE))
@@ -246,24 +255,29 @@ def fit_views(measurements: Measurements, shape: Shape, iterations: int, toleran
         The shape and the (F,) costs.
     """
     envelope = measurements.envelope(shape.log_factor.size > 0)
-    damping = np.full(len(shape.log_depth), _DAMPING[0])
-    active = np.arange(len(damping))
-    for _ in range(iterations):
-        part, start = measurements.views(active), shape.views(active)
-        lagged = lag(part, start)
-        before = costs(part, start, lagged)
-        equations, _ = linearise(part, start, lagged, envelope)
-        factorised = Factorised(equations, envelope, measurements.mesh.edges, damping[active])
-        trial = moved(start, envelope, -factorised.solve_views(equations.gradient), 0.0)
-        after = costs(part, trial, lagged)
-        better = after <= before
-        shape = shape.replaced(active, start.with_views(better, trial))
-        damping[active] = np.clip(damping[active] * np.where(better, 0.1, 10.0), _DAMPING[1], _DAMPING[2])
-        exact = after <= 0.5 * _EXACT * measurements.length_weight.shape[1]
-        active = active[~better | ((before - after > tolerance * before) & ~exact)]
-        if len(active) == 0:
-            break
-    return shape, costs(measurements, shape, lag(measurements, shape))
+    mesh, found = measurements.mesh, replace(shape, **{name: getattr(shape, name).copy() for name in _OF_VIEWS})
+    cost = np.empty(len(shape.log_depth))
+    over_views(
+        fit_views_kernel,
+        len(cost),
+        measurements.image,
+        measurements.image_weight,
+        measurements.log_depth,
+        measurements.length_weight,
+        measurements.factor_weight,
+        mesh.triangles,
+        _terms(measurements, shape, _stencils(measurements, shape)),
+        envelope,
+        iterations,
+        tolerance,
+        0.5 * _EXACT * len(mesh.edges),
+        _DAMPING,
+        found.log_depth,
+        found.correction,
+        found.log_factor,
+        cost,
+    )
+    return found, cost
 
 
 def total_cost(measurements: Measurements, shape: Shape, lagged: Lagged) -> float:

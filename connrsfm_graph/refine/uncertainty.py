@@ -9,11 +9,17 @@ tilts surfaces much more than independent noise of the same size.
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Iterator
 
+import numpy as np
+from numba import njit
+
+from connrsfm_graph.refine.cost import linearise_view
 from connrsfm_graph.refine.elimination import Factorised
+from connrsfm_graph.refine.envelope import factor_damped, substitute_many
 from connrsfm_graph.refine.mesh import Mesh
-from connrsfm_graph.refine.solve import Measurements, Shape, lag, linearise
+from connrsfm_graph.refine.solve import Measurements, Shape, kernel_arguments, lag, linearise
+from connrsfm_graph.threads import over_views
 
 _SAMPLES = 20
 _TOLERANCE = 0.03
@@ -35,37 +41,96 @@ def log_depth_deviation(
             not depend on each other, and all have the same draws.
         seed: of the draws.
     """
-    rng = np.random.default_rng(seed)
-    F, P = shape.log_depth.shape
+    draws = _draws(np.random.default_rng(seed), len(shape.log_depth) if jointly else 1, measurements.mesh, stretch)
+    variance = (_variance_of_all if jointly else _variance_of_each)(measurements, shape, draws)
+    # Variances vary slowly over the surface, their estimates from a few draws do not.
+    return np.asarray(np.sqrt(_around(variance, measurements.mesh)))
+
+
+def _variance_of_all(
+    measurements: Measurements, shape: Shape, draws: Iterator[tuple[np.ndarray, np.ndarray]]
+) -> np.ndarray:
+    """(F, P) mean squares of the log depths' errors, views and lengths solved together."""
     envelope = measurements.envelope(shape.log_factor.size > 0)
     equations, _ = linearise(measurements, shape, lag(measurements, shape), envelope)
     factorised = Factorised(equations, envelope, measurements.mesh.edges)
     rays = envelope.unknown[:, None] + np.array([1, 2])
-    drawn, solutions = F if jointly else 1, []
-    for _ in range(_SAMPLES):
-        noise = _length_noise(rng, drawn, measurements, stretch)
+    square = np.zeros_like(shape.log_depth)
+    for lengths, image in draws:
+        noise = lengths / measurements.length_weight
         gradient = -factorised.spread(noise)
-        gradient[:, rays] += measurements.image_weight[..., None] * rng.standard_normal((drawn, P, 2))
-        if jointly:
-            gradient, _ = factorised.solve(gradient, -(equations.weight * noise).sum(axis=0), _TOLERANCE)
-        solutions.append(gradient)
-    views = np.stack(solutions, axis=-1)
-    if not jointly:
-        views = factorised.solve_views(views)
-    # Variances vary slowly over the surface, their estimates from a few draws do not.
-    return np.asarray(np.sqrt(_around((views[:, envelope.unknown] ** 2).mean(axis=-1), measurements.mesh)))
+        gradient[:, rays] += measurements.image_weight[..., None] * image
+        views, _ = factorised.solve(gradient, -(equations.weight * noise).sum(axis=0), _TOLERANCE)
+        square += views[:, envelope.unknown] ** 2
+    return square / _SAMPLES
 
 
-def _length_noise(rng: np.random.Generator, drawn: int, measurements: Measurements, stretch: bool) -> np.ndarray:
-    """(F, E) errors of the log lengths, drawn for all views or, drawn = 1, the same in each."""
-    edges = measurements.mesh.edges
+def _variance_of_each(
+    measurements: Measurements, shape: Shape, draws: Iterator[tuple[np.ndarray, np.ndarray]]
+) -> np.ndarray:
+    """The same with the lengths known."""
+    lengths, images = (np.concatenate(parts) for parts in zip(*draws, strict=True))
+    envelope = measurements.envelope(shape.log_factor.size > 0)
+    square = np.empty_like(shape.log_depth)
+    arguments = kernel_arguments(measurements, shape, lag(measurements, shape))
+    over_views(_variance_kernel, len(square), *arguments, envelope, lengths, images, square)
+    return square
+
+
+@njit(cache=True, nogil=True)
+def _variance_kernel(
+    first, last, X, f, drift, offset, correction, image_weight, length_weight, factor_weight, terms, envelope,
+    lengths, images, square,
+):  # fmt: skip
+    """Mean squares into `square` (F, P) for views first to last - 1; NaN where a matrix is not positive definite.
+
+    Arguments up to `envelope` are those of `linearise_kernel`, `lengths` (S, E) and `images` (S, P, 2) the draws.
+    """
+    edges, unknown = terms.edges, envelope.unknown
+    n, E, S = len(envelope.first), len(edges), len(lengths)
+    m = n // len(unknown)
+    matrix, gradient, border = np.empty(envelope.start[-1]), np.empty(n), np.empty((E, 2 * m))
+    residual, weight = np.empty(E), np.empty(E)
+    errors = np.empty((n, S))
+    for v in range(first, last):
+        linearise_view(
+            X[v], f[v], drift[v], offset[v], correction[v], image_weight[v], length_weight[v], factor_weight[v], terms,
+            envelope, matrix, gradient, border, residual, weight,
+        )  # fmt: skip
+        if not factor_damped(matrix, 0.0, envelope.first, envelope.start):
+            square[v] = np.nan
+            continue
+        errors[:] = 0.0
+        for e in range(E):
+            scaled = weight[e] / length_weight[v, e]
+            for end in range(2):
+                at = unknown[edges[e, end]]
+                for c in range(m):
+                    for k in range(S):
+                        errors[at + c, k] += scaled * border[e, end * m + c] * lengths[k, e]
+        for i in range(len(unknown)):
+            for c in range(2):
+                for k in range(S):
+                    errors[unknown[i] + 1 + c, k] += image_weight[v, i] * images[k, i, c]
+        substitute_many(matrix, envelope.first, envelope.start, errors)
+        for i in range(len(unknown)):
+            square[v, i] = (errors[unknown[i]] ** 2).mean()
+
+
+def _draws(rng: np.random.Generator, drawn: int, mesh: Mesh, stretch: bool) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Errors of the lengths (drawn, E) and of the image points (drawn, P, 2), in standard deviations."""
+    for _ in range(_SAMPLES):
+        yield _length_noise(rng, drawn, mesh, stretch), rng.standard_normal((drawn, mesh.n_points, 2))
+
+
+def _length_noise(rng: np.random.Generator, drawn: int, mesh: Mesh, stretch: bool) -> np.ndarray:
     if not stretch:
-        return np.asarray(rng.standard_normal((drawn, len(edges))) / measurements.length_weight)
-    field = rng.standard_normal((drawn, measurements.mesh.n_points))
+        return rng.standard_normal((drawn, len(mesh.edges)))
+    field = rng.standard_normal((drawn, mesh.n_points))
     for _ in range(_SMOOTHINGS):
-        field = _around(field, measurements.mesh)
+        field = _around(field, mesh)
     field /= field.std()
-    return np.asarray(0.5 * (field[:, edges[:, 0]] + field[:, edges[:, 1]]) / measurements.length_weight)
+    return np.asarray(0.5 * (field[:, mesh.edges[:, 0]] + field[:, mesh.edges[:, 1]]))
 
 
 def _around(values: np.ndarray, mesh: Mesh) -> np.ndarray:

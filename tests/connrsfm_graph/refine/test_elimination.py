@@ -12,7 +12,7 @@ from connrsfm_graph.errors import ComputationError
 from connrsfm_graph.refine.cost import Weights
 from connrsfm_graph.refine.elimination import Factorised
 from connrsfm_graph.refine.mesh import surface_mesh
-from connrsfm_graph.refine.solve import Measurements, Shape, lag, linearise, moved, total_cost
+from connrsfm_graph.refine.solve import Measurements, Shape, costs, fit_views, lag, linearise, moved, total_cost
 from factors.adapter import make_factor
 from factors.bending import Bending
 from factors.edge_length import edge_length_factor
@@ -122,15 +122,22 @@ def test_the_schur_complement_is_symmetric_and_positive_definite():
     assert np.linalg.eigvalsh(S).min() > 0
 
 
-def test_views_damped_each_on_their_own_take_shorter_steps():
-    measurements, shape = _random_problem(conformal=False, bending=False, seed=2)
-    envelope = measurements.envelope(False)
-    equations, _ = linearise(measurements, shape, lag(measurements, shape), envelope)
-    edges = measurements.mesh.edges
-    free = Factorised(equations, envelope, edges).solve_views(equations.gradient)
-    damped = Factorised(equations, envelope, edges, np.array([0.0, 10.0, 0.0])).solve_views(equations.gradient)
-    assert damped[[0, 2]] == pytest.approx(free[[0, 2]], rel=1e-12)
-    assert np.linalg.norm(damped[1]) < 0.5 * np.linalg.norm(free[1])
+@pytest.mark.parametrize("conformal", [False, True])
+def test_views_fitted_one_by_one_take_the_steps_of_the_whole_problem_with_lengths_held(conformal):
+    measurements, shape = _random_problem(conformal, bending=True, seed=2)
+    envelope, lagged = measurements.envelope(conformal), lag(measurements, shape)
+    equations, _ = linearise(measurements, shape, lagged, envelope)
+    factorised = Factorised(equations, envelope, measurements.mesh.edges, damping=1e-3)
+    step = moved(shape, envelope, -factorised.solve_views(equations.gradient), 0.0)
+    better = np.flatnonzero(costs(measurements, step, lagged) <= costs(measurements, shape, lagged))
+    assert len(better)
+    found, cost = fit_views(measurements, shape, iterations=1, tolerance=0.0)
+    expected = shape.replaced(better, step.views(better))
+    for name in ("log_depth", "correction", "log_factor"):
+        assert getattr(found, name) == pytest.approx(getattr(expected, name), rel=1e-9, abs=1e-12)
+    assert cost == pytest.approx(costs(measurements, found, lag(measurements, found)), rel=1e-12)
+    alone, _ = fit_views(measurements.views(np.array([1])), shape.views(np.array([1])), iterations=1, tolerance=0.0)
+    assert np.array_equal(alone.log_depth[0], found.log_depth[1])
 
 
 def test_a_matrix_that_is_not_positive_definite_is_named():
