@@ -87,6 +87,25 @@ def integrate(
         )
     if config.method == "graph":
         return _integrate_graph(problem, state, known)
+    splines, bending = smoothing_splines(problem, state, config, weight)
+    log_depth = np.zeros(problem.visible.shape)
+    first, second = np.zeros((*log_depth.shape, 2)), np.zeros((*log_depth.shape, 3))
+    for j, spline in enumerate(splines):
+        seen = problem.visible[:, j]
+        depth, first[seen, j], second[seen, j] = spline.surface(problem.image[seen, j], bending)
+        log_depth[seen, j] = depth - depth.mean()
+    return Integrated(log_depth, first, second, bending)
+
+
+def smoothing_splines(
+    problem: Problem, state: State, config: IntegrationConfig, weight: np.ndarray | None = None
+) -> tuple[list[SurfaceSpline], float]:
+    """The solved splines of all images whose gradients fit the first-order terms, and their bending weight.
+
+    Args:
+        problem, state, config, weight: as in `integrate`.
+    """
+    known = problem.constrained() & problem.visible
     weight = np.where(known, 1.0 if weight is None else weight, 0.0)
     systems = []
     for j in range(problem.n_frames):
@@ -109,13 +128,7 @@ def integrate(
         for system in systems:
             system.reweight(config.huber * spread, bending)
         solve_all(systems, bending)
-    log_depth = np.zeros(problem.visible.shape)
-    first, second = np.zeros((*log_depth.shape, 2)), np.zeros((*log_depth.shape, 3))
-    for j, system in enumerate(systems):
-        seen = problem.visible[:, j]
-        depth, first[seen, j], second[seen, j] = system.surface(problem.image[seen, j], bending)
-        log_depth[seen, j] = depth - depth.mean()
-    return Integrated(log_depth, first, second, bending)
+    return systems, bending
 
 
 def balance_scales(problem: Problem, state: State) -> State:

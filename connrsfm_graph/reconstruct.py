@@ -16,6 +16,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from connrsfm_graph.config import as_dict
+from connrsfm_graph.depth_deviation import depth_deviation
 from connrsfm_graph.errors import ComputationError, InputError
 from connrsfm_graph.image_graph import GraphConfig, ImageGraph, select_edges
 from connrsfm_graph.initialise import Start, initialise
@@ -215,9 +216,9 @@ def reconstruct_jointly(
 
     solved = checkpoints.kept("solve", Solved, differentially)
     refined = None
+    with progress.stage("noise level"):
+        sigma = estimate_pixel_noise(image, visible, graph.edges)
     if config.refinement:
-        with progress.stage("noise level"):
-            sigma = estimate_pixel_noise(image, visible, graph.edges)
         with progress.stage("refinement"):
             log_depth = np.where(visible, solved.state.log_depth.T, np.nan)
             refined = (refine if tracks.camera.kappa else refine_from_afar)(
@@ -225,7 +226,8 @@ def reconstruct_jointly(
             )
     with progress.stage("surfaces"):
         if refined is None:
-            surfaces, bending = surfaces_of_terms(problem, solved), solved.integrated.bending
+            deviation = depth_deviation(problem, solved, config.solve, config.integrate, sigma)
+            surfaces, bending = surfaces_of_terms(problem, solved, deviation), solved.integrated.bending
         else:
             constrained = problem.constrained().T & visible
             surfaces, bending = surfaces_of_points(refined, constrained, problem.camera)

@@ -41,11 +41,11 @@ class SurfaceSpline:
         n = int(np.clip(3 + np.ceil(np.sqrt(len(image))), 5, control_points))
         self.grid = SplineGrid.around(cover, n, PADDING)
         extent = float(np.sqrt(self.grid.area))
-        unit = np.array([extent if order in (U, V) else 1.0 for order in orders])
+        self.unit = np.array([extent if order in (U, V) else 1.0 for order in orders])
         first, rows = self.grid.rows(image)
         self.columns = first[:, None] + self.grid.patch()
-        self.rows = rows[:, orders] * unit[:, None]
-        self.target = target * unit
+        self.rows = rows[:, orders] * self.unit[:, None]
+        self.target = target * self.unit
         self.bending = bending_matrix(self.grid) * extent**2
         self.robust = np.ones(len(weight))
         self._control: tuple[float, np.ndarray] | None = None
@@ -72,6 +72,21 @@ class SurfaceSpline:
             self._control = bending, cho_solve((cholesky(normal + bending * self.bending, lower=True), True), right)
         return self._control[1]
 
+    def control_covariance(self, bending: float, covariance: np.ndarray) -> np.ndarray:
+        """(n^2, n^2) covariance of the control points.
+
+        Args:
+            bending: weight of the bending energy.
+            covariance: (N, orders, orders) of the target at every point, in its own unit; points are independent.
+        """
+        normal, _ = self.normal_equations()
+        N, orders = self.target.shape
+        A = (self._row_weight()[:, None] * self.design()).reshape(N, orders, -1)
+        spread = np.einsum("nde,nek->ndk", covariance * self.unit[:, None] * self.unit, A)
+        middle = A.reshape(N * orders, -1).T @ spread.reshape(N * orders, -1)
+        factor = cholesky(normal + bending * self.bending, lower=True), True
+        return np.asarray(cho_solve(factor, cho_solve(factor, middle).T))
+
     def residual_norms(self, bending: float) -> np.ndarray:
         """(N,) misfit of every point."""
         fitted = np.einsum("pdk,pk->pd", self.rows, self.control(bending)[self.columns])
@@ -97,6 +112,13 @@ class SurfaceSpline:
         """Huber weights from the present fit."""
         self.robust = np.minimum(1.0, threshold / np.maximum(self.residual_norms(bending), 1e-300))
         self._control = None
+
+    def values(self, image: np.ndarray) -> np.ndarray:
+        """(N, n^2) dense rows that give the function at image points."""
+        first, rows = self.grid.rows(image)
+        dense = np.zeros((len(image), self.grid.n**2))
+        np.put_along_axis(dense, first[:, None] + self.grid.patch(), rows[:, VALUE], axis=1)
+        return dense
 
     def surface(self, image: np.ndarray, bending: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Fitted function, first- and second-order terms of the surface at image points."""

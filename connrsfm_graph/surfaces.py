@@ -55,8 +55,13 @@ class Surfaces:
         return np.nan_to_num(terms, nan=0.0).transpose(1, 0, 2)
 
 
-def surfaces_of_terms(problem: Problem, solved: Solved) -> Surfaces:
-    """Surfaces of the differential solve and its integration."""
+def surfaces_of_terms(problem: Problem, solved: Solved, deviation: np.ndarray) -> Surfaces:
+    """Surfaces of the differential solve and its integration.
+
+    Args:
+        problem, solved: the measurements, and what was found.
+        deviation: (P, F) standard deviation of log depth, of depth for orthographic cameras.
+    """
     visible, state = problem.visible.T, solved.state
     first, second = np.moveaxis(state.first_order, 0, 1), np.moveaxis(state.second_order, 0, 1)
     # Points without a usable pair lie on the surface through the others.
@@ -68,7 +73,10 @@ def surfaces_of_terms(problem: Problem, solved: Solved) -> Surfaces:
     depth = np.exp(state.log_depth.T) if problem.camera.kappa else state.log_depth.T
     points = problem.camera.points(image, depth)
     outlier = np.zeros_like(visible)
-    return _surfaces(points, image, (first, second), visible, problem.camera, unknown, unknown, visible & bare, outlier)
+    depth_std = deviation.T * depth if problem.camera.kappa else deviation.T
+    return _surfaces(
+        points, image, (first, second), visible, problem.camera, depth_std, unknown, visible & bare, outlier
+    )
 
 
 def surfaces_of_points(

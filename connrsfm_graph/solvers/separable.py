@@ -91,7 +91,7 @@ def solve(
     state, costs = start, []
     if config.schedule == "joint":
         costs.append(total_cost(problem, state, backend, config.noise))
-        minimum = backend.minimise(problem, state, _joint(problem), config.noise, settings=config.levenberg)
+        minimum = backend.minimise(problem, state, active_variables(problem), config.noise, settings=config.levenberg)
         costs.append(float(minimum.cost.sum()))
         for _ in range(config.restarts):
             minimum, improved = _restart_from_surface(problem, minimum, backend, config)
@@ -118,7 +118,7 @@ def _restart_from_surface(
     start = State(start.frame[again], start.log_scale[again])
     part = problem.points(again)
     start = with_pair_scale(part, start, config.noise)
-    trial = backend.minimise(part, start, _joint(part), config.noise, settings=config.levenberg)
+    trial = backend.minimise(part, start, active_variables(part), config.noise, settings=config.levenberg)
     better = trial.cost < (1.0 - RESTART_GAIN) * minimum.cost[again]
     chosen = again[better]
     kept = Minimum(minimum.state.updated(), minimum.cost.copy(), minimum.iterations.copy())
@@ -159,7 +159,8 @@ def _with_depth(problem: Problem, state: State, integrated: Integrated, noise: P
     return with_pair_scale(problem, state.updated(log_depth=integrated.log_depth), noise)
 
 
-def _joint(problem: Problem) -> tuple[str, ...]:
+def active_variables(problem: Problem) -> tuple[str, ...]:
+    """What the joint schedule minimises over."""
     return JOINT if problem.camera.kappa else JOINT_KNOWN_SCALE
 
 
