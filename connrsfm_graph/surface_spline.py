@@ -5,7 +5,8 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-from scipy.linalg import cho_solve, cholesky, eigh, solve_triangular
+from numba import njit
+from scipy.linalg import cho_solve, cholesky, solve_triangular
 
 from connrsfm_graph.threads import mapped
 from connrsfm_graph.warps.basis import UU, UV, VALUE, VV, SplineGrid, U, V
@@ -50,26 +51,23 @@ class SurfaceSpline:
         self.robust = np.ones(len(weight))
         self._control: tuple[float, np.ndarray] | None = None
 
-    def design(self) -> np.ndarray:
-        """(N * orders, n^2) dense rows."""
-        N, orders, _ = self.rows.shape
-        A = np.zeros((N, orders, self.grid.n**2))
-        A[np.arange(N)[:, None, None], np.arange(orders)[:, None], self.columns[:, None, :]] = self.rows
-        return A.reshape(N * orders, -1)
-
     def normal_equations(self) -> tuple[np.ndarray, np.ndarray]:
-        """(n^2, n^2) normal matrix of the data and right-hand side."""
-        A, w = self.design(), self._row_weight()
-        normal = A.T @ (w[:, None] * A)
+        """(n^2, n^2) normal matrix of the data, lower triangle, and right-hand side."""
         # A ridge far below the data holds what no point sees: the constant and distant control points.
-        normal += 1e-10 * np.trace(normal) / len(normal) * np.eye(len(normal)) + SMOOTHINGS[0] * self.bending
-        return normal, A.T @ (w * self.target.ravel())
+        normal, right = SMOOTHINGS[0] * self.bending, np.zeros(len(self.bending))
+        weight = self.weight * self.robust
+        trace = np.einsum("p,pdk,pdk->", weight, self.rows, self.rows)
+        normal[np.diag_indices_from(normal)] += 1e-10 * trace / len(normal)
+        _add_products(self.columns, self.rows, self.target, weight, normal, right)
+        return normal, right
 
     def control(self, bending: float) -> np.ndarray:
         """(n^2,) control points for a bending weight."""
         if self._control is None or self._control[0] != bending:
             normal, right = self.normal_equations()
-            self._control = bending, cho_solve((cholesky(normal + bending * self.bending, lower=True), True), right)
+            normal += bending * self.bending
+            lower = cholesky(normal, lower=True, overwrite_a=True, check_finite=False)
+            self._control = bending, cho_solve((lower, True), right, check_finite=False)
         return self._control[1]
 
     def control_covariance(self, bending: float, covariance: np.ndarray) -> np.ndarray:
@@ -81,7 +79,9 @@ class SurfaceSpline:
         """
         normal, _ = self.normal_equations()
         N, orders = self.target.shape
-        A = (self._row_weight()[:, None] * self.design()).reshape(N, orders, -1)
+        A = np.zeros((N, orders, len(normal)))
+        A[np.arange(N)[:, None, None], np.arange(orders)[:, None], self.columns[:, None]] = self.rows
+        A *= (self.weight * self.robust)[:, None, None]
         spread = np.einsum("nde,nek->ndk", covariance * self.unit[:, None] * self.unit, A)
         middle = A.reshape(N * orders, -1).T @ spread.reshape(N * orders, -1)
         factor = cholesky(normal + bending * self.bending, lower=True), True
@@ -101,9 +101,9 @@ class SurfaceSpline:
         normal, right = self.normal_equations()
         lower = cholesky(normal, lower=True)
         half = solve_triangular(lower, self.bending, lower=True)
-        gamma, vectors = eigh(solve_triangular(lower, half.T, lower=True))
+        gamma, vectors = np.linalg.eigh(solve_triangular(lower, half.T, lower=True))
         right = vectors.T @ solve_triangular(lower, right, lower=True)
-        total = float((self._row_weight() * self.target.ravel() ** 2).sum())
+        total = float(((self.weight * self.robust)[:, None] * self.target**2).sum())
         shrink = 1.0 / (1.0 + bending[:, None] * np.maximum(gamma, 0.0))
         rss = total - (right**2 * (2 * shrink - shrink**2)).sum(axis=1)
         return np.maximum(rss, 0.0), shrink.sum(axis=1), self.target.size
@@ -126,8 +126,27 @@ class SurfaceSpline:
         first, second = jet[:, (U, V)], jet[:, (UU, UV, VV)]
         return jet[:, 0], first, _terms_of_log(first, second, self.camera)
 
-    def _row_weight(self) -> np.ndarray:
-        return np.repeat(self.weight * self.robust, self.target.shape[1])
+
+@njit(cache=True, nogil=True)
+def _add_products(columns, rows, target, weight, normal, right):
+    """Add weight_p |rows_p c[columns_p] - target_p|^2 to the normal equations of c, lower triangle.
+
+    Args:
+        columns: (N, 16) ascending.
+        rows: (N, D, 16).
+        target: (N, D).
+        weight: (N,).
+        normal, right: (M, M) and (M,), changed in place.
+    """
+    for p in range(len(columns)):
+        at = columns[p]
+        for d in range(rows.shape[1]):
+            row = rows[p, d]
+            for k in range(16):
+                scaled = weight[p] * row[k]
+                right[at[k]] += scaled * target[p, d]
+                for m in range(k + 1):
+                    normal[at[k], at[m]] += scaled * row[m]
 
 
 def terms_of_depth(
@@ -151,25 +170,29 @@ def terms_of_depth(
     Returns:
         The terms and the bending weight.
     """
-    splines = [
-        SurfaceSpline(
-            image[j, seen],
-            (VALUE,),
-            log_depth[j, seen][:, None],
-            np.ones(seen.sum()),
-            image[j, seen],
-            control_points,
-            camera,
+    splines = list(
+        mapped(
+            lambda j: SurfaceSpline(
+                image[j, known[j]],
+                (VALUE,),
+                log_depth[j, known[j]][:, None],
+                np.ones(known[j].sum()),
+                image[j, known[j]],
+                control_points,
+                camera,
+            ),
+            range(len(known)),
         )
-        for j, seen in enumerate(known)
-    ]
-    if bending is None:
-        bending = choose_bending(splines)
-    solve_all(splines, bending)
+    )
+    chosen = choose_bending(splines) if bending is None else bending
     first, second = np.zeros((*known.shape, 2)), np.zeros((*known.shape, 3))
-    for j, (spline, seen) in enumerate(zip(splines, known, strict=True)):
-        _, first[j, seen], second[j, seen] = spline.surface(image[j, seen], bending)
-    return first, second, bending
+
+    def evaluate(j: int) -> None:
+        _, first[j, known[j]], second[j, known[j]] = splines[j].surface(image[j, known[j]], chosen)
+
+    for _ in mapped(evaluate, range(len(known))):
+        pass
+    return first, second, chosen
 
 
 def solve_all(systems: list[SurfaceSpline], bending: float) -> None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 
 VALUE, U, V, UU, UV, VV = range(6)
 
@@ -85,8 +86,18 @@ def axis_rows(t: np.ndarray) -> np.ndarray:
 
 
 def _tensor_rows(tu: np.ndarray, tv: np.ndarray, step: np.ndarray) -> np.ndarray:
-    u, v = axis_rows(tu), axis_rows(tv)
     hu, hv = step
-    parts = [(0, 0, 1.0), (1, 0, hu), (0, 1, hv), (2, 0, hu**2), (1, 1, hu * hv), (0, 2, hv**2)]
-    outer = [u[:, i, :, None] * v[:, j, None, :] / scale for i, j, scale in parts]
-    return np.stack(outer, axis=1).reshape(len(u), 6, 16)
+    rows = np.empty((len(tu), 6, 4, 4))
+    scale = np.array([1.0, hu, hv, hu**2, hu * hv, hv**2])
+    _multiply(axis_rows(tu), axis_rows(tv), scale, rows)
+    return rows.reshape(-1, 6, 16)
+
+
+@njit(cache=True, nogil=True)
+def _multiply(u, v, scale, rows):
+    """Rows (N, 6, 4, 4) of both axes together from those of each (N, 3, 4), in units of `scale` (6,)."""
+    for p in range(len(rows)):
+        for order, (i, j) in enumerate(((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))):
+            for k in range(4):
+                for m in range(4):
+                    rows[p, order, k, m] = u[p, i, k] * v[p, j, m] / scale[order]
