@@ -1,7 +1,7 @@
 """Camera trajectory and deforming map in one world frame, from tracks and, if there is any, odometry.
 
-Writes trajectory.tum (camera to world), map.ply (points of all views, with the numbers of view and point), and
-problem.npz (what was fused, to load in Python).
+Writes trajectory.tum (camera to world), map.ply (points of all views, with the numbers of view and point), problem.npz
+(what was fused, to load in Python), and graph.dot (its factor graph to look at, views in groups where there are many).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from connrsfm_graph.slam import Fused, FusionProblem, SlamConfig
     from connrsfm_graph.tracks import Tracks
 
-TRAJECTORY_FILE, MAP_FILE, PROBLEM_FILE = "trajectory.tum", "map.ply", "problem.npz"
+TRAJECTORY_FILE, MAP_FILE, PROBLEM_FILE, GRAPH_FILE = "trajectory.tum", "map.ply", "problem.npz", "graph.dot"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -68,6 +68,7 @@ def run(arguments: argparse.Namespace) -> None:
     from connrsfm_graph.progress import Progress
     from connrsfm_graph.slam import FusionConfig, MapModel, SlamConfig, read_tum, save_problem, write_map, write_tum
     from connrsfm_graph.slam.cameras import STANDSTILL
+    from connrsfm_graph.slam.drawing import write_drawing
     from connrsfm_graph.slam.trajectory import steps_between
     from connrsfm_graph.tracks import load_tracks
 
@@ -86,15 +87,24 @@ def run(arguments: argparse.Namespace) -> None:
     steps, first = (None, None) if odometry is None else (steps_between(odometry), odometry[0])
     progress = Progress()
     fusion = _all_together if arguments.live is None else _live
-    problem, fused = fusion(arguments, tracks, config, steps, first, progress)
+    background = None
+    if arguments.background is not None:
+        rigid = load_tracks(arguments.background, arguments.intrinsics)
+        if rigid.n_frames != tracks.n_frames:
+            raise InputError(
+                f"{arguments.background}: holds {rigid.n_frames} images, expected one per view, {tracks.n_frames}"
+            )
+        background = np.nan_to_num(rigid.normalised()), rigid.visible
+    problem, fused = fusion(arguments, tracks, config, steps, first, background, progress)
     with folder_written_beside(out) as part:
         write_tum(part / TRAJECTORY_FILE, fused.poses, times)
         write_map(part / MAP_FILE, fused)
         save_problem(part / PROBLEM_FILE, problem)
+        write_drawing(part / GRAPH_FILE, problem)
     moved = steps is not None and bool(np.linalg.norm(steps[:, :3, 3], axis=1).max(initial=0.0) > STANDSTILL)
     unit = "of odometry" if moved else "of the first view's reconstruction"
     print(f"{len(fused.poses)} poses and {np.isfinite(fused.points).all(axis=-1).sum()} map points, in the unit {unit}")
-    print(f"{out}: {TRAJECTORY_FILE}, {MAP_FILE}, {PROBLEM_FILE}")
+    print(f"{out}: {TRAJECTORY_FILE}, {MAP_FILE}, {PROBLEM_FILE}, {GRAPH_FILE}")
 
 
 def _all_together(
@@ -103,18 +113,12 @@ def _all_together(
     config: SlamConfig,
     steps: np.ndarray | None,
     first: np.ndarray | None,
+    background: tuple[np.ndarray, np.ndarray] | None,
     progress: Progress,
 ) -> tuple[FusionProblem, Fused]:
     """All views are reconstructed, then fused."""
-    import numpy as np
-
     from connrsfm_graph.slam import Sightings, estimate_noise, pose_problem, solve_problem
-    from connrsfm_graph.tracks import load_tracks
 
-    background = None
-    if arguments.background is not None:
-        tracked = load_tracks(arguments.background, arguments.intrinsics)
-        background = np.nan_to_num(tracked.normalised()), tracked.visible
     reconstruction = _reconstruction(arguments, tracks, progress)
     with progress.stage("noise levels"):
         noise = estimate_noise(reconstruction)
@@ -129,6 +133,7 @@ def _live(
     config: SlamConfig,
     steps: np.ndarray | None,
     first: np.ndarray | None,
+    background: tuple[np.ndarray, np.ndarray] | None,
     progress: Progress,
 ) -> tuple[FusionProblem, Fused]:
     """The first views are reconstructed together, the others come one by one; all are let go of in the end."""
@@ -139,12 +144,10 @@ def _live(
 
     if not 3 <= arguments.live <= tracks.n_frames:
         raise InputError(f"--live is {arguments.live}, expected 3 to {tracks.n_frames}, the number of views")
-    if arguments.background is not None:
-        raise InputError("--background cannot be used with --live; leave one of them out")
     known = Sightings.of(_reconstruction(arguments, tracks.select(frames=range(arguments.live)), progress))
     with progress.stage("views"):
         live = fuse_live(
-            known, np.nan_to_num(tracks.normalised()), tracks.visible, config, steps, first, progress.update
+            known, np.nan_to_num(tracks.normalised()), tracks.visible, config, steps, first, progress.update, background
         )
     with progress.stage("fusion"):
         fused = live.fusion.finish()

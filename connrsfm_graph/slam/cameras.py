@@ -65,9 +65,6 @@ def add_background(
     Returns:
         Number of landmarks added.
     """
-    camera = gtsam.Cal3_S2()
-    loss = gtsam.noiseModel.mEstimator.Huber.Create(LANDMARK_HUBER)
-    noise = gtsam.noiseModel.Robust.Create(loss, gtsam.noiseModel.Isotropic.Sigma(2, sigma))
     usable = np.flatnonzero(visible.sum(axis=0) >= 2)
     for landmark in usable.tolist():
         views = np.flatnonzero(visible[:, landmark]).tolist()
@@ -75,8 +72,16 @@ def add_background(
         m = key(RIGID_LANDMARK, landmark)
         values.insert(m, nearest_point(poses, image[views, landmark], distance))
         for view in views:
-            graph.add(gtsam.GenericProjectionFactorCal3_S2(image[view, landmark], noise, pose_key(view), m, camera))
+            graph.add(landmark_factor(landmark, view, image[view, landmark], sigma))
     return len(usable)
+
+
+def landmark_factor(landmark: int, view: int, image: np.ndarray, sigma: float) -> gtsam.NonlinearFactor:
+    """Projection of a rigid landmark to an image point (2,), both coordinates with noise `sigma`, normalised."""
+    loss = gtsam.noiseModel.mEstimator.Huber.Create(LANDMARK_HUBER)
+    noise = gtsam.noiseModel.Robust.Create(loss, gtsam.noiseModel.Isotropic.Sigma(2, sigma))
+    m = key(RIGID_LANDMARK, landmark)
+    return gtsam.GenericProjectionFactorCal3_S2(image, noise, pose_key(view), m, gtsam.Cal3_S2())
 
 
 def nearest_point(poses: list[gtsam.Pose3], image: np.ndarray, distance: float) -> np.ndarray:

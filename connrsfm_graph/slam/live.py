@@ -14,12 +14,14 @@ import numpy as np
 
 from connrsfm_graph.errors import InputError
 from connrsfm_graph.slam.cameras import start_cameras
+from connrsfm_graph.slam.growing_background import GrowingBackground
+from connrsfm_graph.slam.growing_graph import push_back
 from connrsfm_graph.slam.incremental import IncrementalConfig, IncrementalFusion
 from connrsfm_graph.slam.keyframes import KeyframeConfig, Keyframes
 from connrsfm_graph.slam.noise import FusionNoise, estimate_noise, image_noise
 from connrsfm_graph.slam.run import SlamConfig
-from connrsfm_graph.slam.sightings import Sightings
-from factors.keys import VIEW_SCALE, key
+from connrsfm_graph.slam.sightings import Sightings, View
+from factors.keys import VIEW_SCALE, describe, key
 
 
 class LiveFusion:
@@ -34,6 +36,7 @@ class LiveFusion:
         pose: np.ndarray | None = None,
         config: IncrementalConfig | None = None,
         keyframes: KeyframeConfig | None = None,
+        background: tuple[np.ndarray, np.ndarray] | None = None,
     ):
         """Take in the first views.
 
@@ -43,6 +46,8 @@ class LiveFusion:
             steps, sigmas: odometry between the first views as in `cameras.add_odometry`, or None.
             pose: (4, 4) of the first view; the origin of the world where None.
             config, keyframes: settings.
+            background: image points (F, B, 2), normalised, and visibility (F, B) of points that do not move, in the
+                first views.
 
         Raises:
             InputError: the first views cannot be fused.
@@ -53,13 +58,14 @@ class LiveFusion:
         """All estimates."""
         self.keyframes = Keyframes(keyframes)
         """What new views get their surfaces from."""
+        distance = float(np.median(np.exp(first.log_depth[first.seen] + log_scale)))
+        self.background = GrowingBackground(noise.image, distance)
+        """What the views saw of points that do not move."""
         for number in range(first.n_views):
-            view = first.view(number)
+            step, deviations = None, None
             if number and steps is not None and sigmas is not None:
-                self.fusion.add_view(view, steps[number - 1], sigmas[number - 1])
-            else:
-                self.fusion.add_view(view)
-            self.keyframes.offer(view)
+                step, deviations = steps[number - 1], sigmas[number - 1]
+            self._take_in(first.view(number), step, deviations, rigid=_sighted(background, number))
 
     def add(
         self,
@@ -69,6 +75,7 @@ class LiveFusion:
         sigmas: np.ndarray | None = None,
         factors: gtsam.NonlinearFactorGraph | None = None,
         values: gtsam.Values | None = None,
+        rigid: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> int:
         """Take in the tracks of the next view.
 
@@ -76,6 +83,7 @@ class LiveFusion:
             points: (N,) numbers of the points seen, each once.
             image: (N, 2) normalised image coordinates.
             step, sigmas, factors, values: as in `IncrementalFusion.add_view`.
+            rigid: numbers (M,) and image points (M, 2) of the points seen that do not move, numbered on their own.
 
         Returns:
             Number of the view.
@@ -87,9 +95,46 @@ class LiveFusion:
             view = self.keyframes.depths(points, image)
         except InputError as error:
             raise InputError(f"view {self.fusion.n_views}: {error}; the view was not added") from error
-        number = self.fusion.add_view(view, step, sigmas, factors, values)
+        return self._take_in(view, step, sigmas, factors, values, rigid)
+
+    def _take_in(
+        self,
+        view: View,
+        step: np.ndarray | None = None,
+        sigmas: np.ndarray | None = None,
+        factors: gtsam.NonlinearFactorGraph | None = None,
+        values: gtsam.Values | None = None,
+        rigid: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> int:
+        """Fuse a view and, once that is done, keep what later ones need of it."""
+        number = self.fusion.n_views
+        if rigid is not None:
+            try:
+                graph, starts = self.background.factors(number, *rigid, self.fusion.pose)
+                for k in [] if values is None else values.keys():
+                    if starts.exists(k):
+                        raise InputError(f"{describe(k)} is there already")
+            except InputError as error:
+                raise InputError(f"view {number}: {error}; the view was not added") from error
+            if factors is not None:
+                push_back(graph, factors)
+            if values is not None:
+                starts.insert(values)
+            factors, values = graph, starts
+        self.fusion.add_view(view, step, sigmas, factors, values)
+        if rigid is not None:
+            self.background.take_in(number, *rigid)
         self.keyframes.offer(view)
         return number
+
+
+def _sighted(background: tuple[np.ndarray, np.ndarray] | None, view: int) -> tuple[np.ndarray, np.ndarray] | None:
+    """Numbers and image points of what a view saw of the background."""
+    if background is None:
+        return None
+    image, visible = background
+    (points,) = np.nonzero(visible[view])
+    return points, image[view, points]
 
 
 def fuse_live(
@@ -100,6 +145,7 @@ def fuse_live(
     steps: np.ndarray | None = None,
     pose: np.ndarray | None = None,
     progress: Callable[[int, int], None] | None = None,
+    background: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> LiveFusion:
     """Take in a recorded sequence view by view, with noise levels from its first views.
 
@@ -111,12 +157,15 @@ def fuse_live(
         steps: (F-1, 4, 4) odometry between all views, or None.
         pose: (4, 4) of the first view; the origin of the world where None.
         progress: called with (views taken in, F).
+        background: image points (F, B, 2), normalised, and visibility (F, B) of points that do not move.
 
     Raises:
-        InputError: a view cannot be used.
+        InputError: a view cannot be used, or numbers of views do not fit.
     """
     config = config or SlamConfig()
     F, K = len(image), first.n_views
+    if background is not None and len(background[1]) != F:
+        raise InputError(f"the background is tracked through {len(background[1])} views, the points through {F}")
     sigmas = None if steps is None else config.odometry_sigmas(steps)
     sigma = image_noise(image[:K], visible[:K])
     incremental = IncrementalConfig(map=config.fusion.map)
@@ -128,13 +177,12 @@ def fuse_live(
         pose,
         incremental,
         KeyframeConfig(image_sigma=max(sigma, 1e-6)),
+        background,
     )
     for view in range(K, F):
         (points,) = np.nonzero(visible[view])
-        if steps is None or sigmas is None:
-            live.add(points, image[view, points])
-        else:
-            live.add(points, image[view, points], steps[view - 1], sigmas[view - 1])
+        step, deviations = (None, None) if steps is None or sigmas is None else (steps[view - 1], sigmas[view - 1])
+        live.add(points, image[view, points], step, deviations, rigid=_sighted(background, view))
         if progress is not None:
             progress(view + 1, F)
     return live

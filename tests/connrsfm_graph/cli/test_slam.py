@@ -57,6 +57,7 @@ def test_trajectory_map_and_problem(connrsfm, files, scene, tmp_path):
     _, odometry = read_tum(files["odometry.tum"])
     assert trajectory_error(poses, scene.poses).ate < trajectory_error(odometry, scene.poses).ate
     assert (out / "map.ply").read_bytes().startswith(b"ply\n")
+    assert "rigid landmarks" in (out / "graph.dot").read_text()
     np.testing.assert_allclose(solve_problem(load_problem(out / "problem.npz")).poses, poses, atol=1e-6)
 
 
@@ -91,9 +92,12 @@ def test_views_one_by_one(connrsfm, files, scene, tmp_path):
     _, poses = read_tum(out / "trajectory.tum")
     assert len(poses) == F
     np.testing.assert_allclose(solve_problem(load_problem(out / "problem.npz")).poses, poses, atol=1e-3)
+    ended = connrsfm(*given, "--live", "10", "--background", files["background.npz"], "--out", tmp_path / "held")
+    assert ended.status == 0, ended.err
+    _, held = read_tum(tmp_path / "held" / "trajectory.tum")
+    assert trajectory_error(held, scene.poses).rpe_rotation_deg < trajectory_error(poses, scene.poses).rpe_rotation_deg
     for more, message in (
         (("--live", "2"), "--live is 2, expected 3 to 15"),
-        (("--live", "10", "--background", files["background.npz"]), "--background cannot be used with --live"),
         (("--live", "11"), "holds 10 images and 30 points, expected"),
     ):
         ended = connrsfm(*given, *more, "--out", tmp_path / "other")
@@ -116,8 +120,11 @@ def test_bad_input_is_one_sentence_and_writes_nothing(connrsfm, files, tmp_path)
     ended = connrsfm("slam", tmp_path / "far.npz", "--out", out)
     assert ended.status == 2
     assert "far.npz: seen by an orthographic camera" in ended.err
+    with np.load(files["background.npz"]) as arrays:
+        np.savez(tmp_path / "few.npz", tracks=arrays["tracks"][:7], K=arrays["K"])
     given = ("slam", files["tracks.npz"], "--result", files["result.npz"], "--out", out)
     for more, message in (
+        (("--background", tmp_path / "few.npz"), "few.npz: holds 7 images, expected one per view, 15"),
         (("--odometry", short), "short.tum: holds 1 poses, expected one per view, 15"),
         (("--odometry", tmp_path / "none.tum"), "none.tum: no such file"),
         (("--odometry-rotation", "-1"), "odometry_rotation_deg is -1.0, expected a positive number"),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import gtsam
 import numpy as np
 import pytest
@@ -19,9 +21,12 @@ from connrsfm_graph.slam import (
     write_map,
     write_tum,
 )
+from connrsfm_graph.slam.drawing import write_drawing
 from connrsfm_graph.slam.trajectory import chained, steps_between
 from factors.adapter import make_factor
 from tests.connrsfm_graph.slam.scene import NOISE, posed
+
+PROJECTION = gtsam.GenericProjectionFactorCal3_S2
 
 
 def random_poses(n, seed=0):
@@ -116,3 +121,40 @@ def test_map_holds_every_point_with_its_view(tmp_path):
         assert f"element vertex {len(table)}" in header.decode()
         assert len(table) == (case.sightings.seen.sum() if view is None else case.sightings.seen[view].sum())
         np.testing.assert_allclose(table["xyz"], fused.points[table["view"], table["point"]], rtol=1e-5, atol=1e-6)
+
+
+def nodes_and_edges(path):
+    lines = [line.strip() for line in path.read_text().splitlines()]
+    edges = [line for line in lines if " -- " in line]
+    return [line for line in lines if line.endswith('"];') and line not in edges], edges
+
+
+def test_the_drawing_counts_every_factor(tmp_path):
+    case = posed(n_frames=5, n_points=12, gaps=0.3)
+    problem = pose_problem(case.sightings, noise=NOISE, steps=case.steps, background=case.background)
+    write_drawing(tmp_path / "graph.dot", problem)
+    nodes, edges = nodes_and_edges(tmp_path / "graph.dot")
+    assert len(nodes) == 5 + 5 + 1
+    counts = {}
+    for edge in edges:
+        kind, count = re.search(r'label="(.*): (\d+)"', edge).groups()
+        counts[kind] = counts.get(kind, 0) + int(count)
+    sightings = int(case.sightings.seen.sum())
+    projections = sum(isinstance(problem.graph.at(n), PROJECTION) for n in range(problem.graph.size()))
+    ties = sightings - int(case.sightings.seen.any(axis=0).sum())
+    assert counts == {
+        "anchor": sightings,
+        "motion": ties,
+        "odometry": 4,
+        "projection": projections,
+        "scale link": 4,
+    }
+
+
+def test_the_drawing_of_many_views_stays_small(tmp_path):
+    case = posed(n_frames=45, n_points=12, gaps=0.5)
+    problem = pose_problem(case.sightings, noise=NOISE, steps=case.steps)
+    write_drawing(tmp_path / "graph.dot", problem, most=10)
+    nodes, _ = nodes_and_edges(tmp_path / "graph.dot")
+    assert len(nodes) == 2 * 9
+    assert 'label="views 40 to 44"' in (tmp_path / "graph.dot").read_text()

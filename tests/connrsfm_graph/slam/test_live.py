@@ -73,3 +73,57 @@ def test_a_view_that_cannot_be_used_changes_nothing(scene, image):
             live.add(*bad)
     assert (live.fusion.n_views, len(live.keyframes.views)) == (K, keyframes)
     assert live.add(points, image[K, points], steps[K - 1], odometry[K - 1]) == K
+
+
+@pytest.fixture(scope="module")
+def before_background():
+    """The scene before a background, with noise in its image points."""
+    scene = passing_camera(F, P, 40, seed=2)
+    rng = np.random.default_rng(6)
+    return scene, scene.background_image + IMAGE_SIGMA * rng.normal(size=scene.background_image.shape)
+
+
+def test_a_rigid_background_holds_the_camera(before_background, image):
+    scene, rigid = before_background
+    steps, _ = noisy_odometry(scene.poses, seed=5)
+    first = first_views(scene, image, scene.visible)
+    errors = []
+    for background in (None, (rigid, scene.background_visible)):
+        live = fuse_live(first, image, scene.visible, None, steps, scene.poses[0], background=background)
+        poses = np.array([live.fusion.pose(view) for view in range(F)])
+        errors.append(trajectory_error(poses, scene.poses))
+    assert errors[1].ate < 0.8 * errors[0].ate
+    assert errors[1].rpe_rotation_deg < 0.6 * errors[0].rpe_rotation_deg
+    seen_thrice = (scene.background_visible.sum(axis=0) >= 3).sum()
+    assert live.fusion.values.size() == 2 * F + seen_thrice
+    landmarks = live.fusion.finish().others
+    assert landmarks.size() == seen_thrice
+
+
+def test_a_background_that_cannot_be_used_changes_nothing(before_background, image):
+    scene, rigid = before_background
+    steps, _ = noisy_odometry(scene.poses, seed=5)
+    odometry, seen = sigmas(steps), scene.background_visible
+    with pytest.raises(InputError, match="background is tracked through 3 views, the points through 30"):
+        fuse_live(first_views(scene, image, scene.visible), image, scene.visible, background=(rigid[:3], seen[:3]))
+
+    def started():
+        first = first_views(scene, image, scene.visible)
+        given = steps[: K - 1], odometry[: K - 1], scene.poses[0]
+        return LiveFusion(first, NOISE, *given, background=(rigid, seen))
+
+    live, twin = started(), started()
+    points, landmarks = np.flatnonzero(scene.visible[K]), np.flatnonzero(seen[K])
+    nan = rigid[K, landmarks].copy()
+    nan[1, 0] = np.nan
+    for message, bad, step in (
+        ("of the background is not a finite image point", (landmarks, nan), odometry[K - 1]),
+        ("seen twice", (np.zeros_like(landmarks), rigid[K, landmarks]), odometry[K - 1]),
+        ("six positive standard deviations", (landmarks, rigid[K, landmarks]), np.zeros(6)),
+    ):
+        with pytest.raises(InputError, match=f"view {K}: .*{message}.*the view was not added"):
+            live.add(points, image[K, points], steps[K - 1], step, rigid=bad)
+    for estimate in (live, twin):
+        good = landmarks, rigid[K, landmarks]
+        assert estimate.add(points, image[K, points], steps[K - 1], odometry[K - 1], rigid=good) == K
+    np.testing.assert_array_equal(live.fusion.pose(K), twin.fusion.pose(K))
