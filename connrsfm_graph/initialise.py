@@ -63,7 +63,8 @@ def with_pair_scale(problem: Problem, state: State, noise: PairNoise) -> State:
 
 def with_closed_form_scale(problem: Problem, state: State, noise: PairNoise) -> State:
     """Step 4: the conformal scale of every pair, given all else; pairs that do not show it keep their value."""
-    log_rho = closed_form_log_rho(problem.data, problem.weight, state.frame, problem.edges, noise, problem.camera)
+    precision = problem.row_precisions(noise)
+    log_rho = closed_form_log_rho(problem.data, problem.weight, state.frame, problem.edges, precision, problem.camera)
     a, b = problem.edges.T
     depth_ratio = state.log_depth[:, b] - state.log_depth[:, a]
     known = (problem.weight > 0) & np.isfinite(log_rho)

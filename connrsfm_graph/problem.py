@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from factors.noise import PairNoise
 from factors.surface import PERSPECTIVE, Camera, planar_second_order
 from factors.warp_jet import WarpJet
 
@@ -29,6 +30,8 @@ class Problem:
     weight: np.ndarray
     """(P, E) weight of each pair, 0 where it is absent."""
     camera: Camera = PERSPECTIVE
+    precision: np.ndarray | None = None
+    """(P, E, 21) factors on the precision that the pair factors' noise gives each row, positive; None for 1."""
 
     @property
     def n_points(self) -> int:
@@ -57,7 +60,15 @@ class Problem:
             visible=self.visible[block],
             data=self.data[block],
             weight=self.weight[block],
+            precision=None if self.precision is None else self.precision[block],
         )
+
+    def row_precisions(self, noise: PairNoise) -> np.ndarray:
+        """(P, E, 21) reciprocal standard deviations of the rows of every pair; 0 for dropped blocks."""
+        shared = noise.precisions()
+        if self.precision is None:
+            return np.tile(shared, (self.n_points, self.n_edges, 1))
+        return shared * self.precision
 
 
 @dataclass(frozen=True)

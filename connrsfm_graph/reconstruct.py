@@ -78,7 +78,9 @@ def default_config(mode: Literal["default", "paper"] = "default") -> Config:
     """The best known settings, or the published algorithm as written."""
     if mode == "default":
         return Config()
-    return Config(warps=WarpConfig(model="schwarzian"), solve=SolveConfig(schedule="separable"), refinement=False)
+    return Config(
+        warps=WarpConfig(model="schwarzian"), solve=SolveConfig(schedule="separable", sigmas="fixed"), refinement=False
+    )
 
 
 @dataclass(frozen=True)
@@ -212,7 +214,8 @@ def reconstruct_jointly(
         with progress.stage("pre-step"):
             start = initialise(problem, backend, config.solve.levenberg, config.start, config.seed)
         with progress.stage("solve"):
-            return solve(problem, start, backend, config.solve, config.integrate, progress.update)
+            covariance = warps.jets.covariance
+            return solve(problem, start, backend, config.solve, config.integrate, progress.update, covariance)
 
     solved = checkpoints.kept("solve", Solved, differentially)
     refined = None
@@ -226,7 +229,7 @@ def reconstruct_jointly(
             )
     with progress.stage("surfaces"):
         if refined is None:
-            deviation = depth_deviation(problem, solved, config.solve, config.integrate, sigma)
+            deviation = depth_deviation(solved.weighed(problem), solved, config.solve, config.integrate, sigma)
             surfaces, bending = surfaces_of_terms(problem, solved, deviation), solved.integrated.bending
         else:
             constrained = problem.constrained().T & visible

@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit, prange
 
 from factors.conformal_pair import COLUMNS, pair_kernel, pair_workspace
-from factors.noise import ROWS, PairNoise
+from factors.noise import ROWS
 from factors.surface import PERSPECTIVE, Camera
 
 _MOST_STEPS = 100
@@ -130,7 +130,7 @@ def _scales(data, weight, frame, edges, kappa, precision, log_rho):
         for e in range(E):
             if weight[i, e] > 0.0:
                 ya, yb = frame[i, edges[e, 0], :5], frame[i, edges[e, 1], :5]
-                log_rho[i, e] = scale_kernel(data[i, e], ya, yb, kappa, precision, workspace, r, J)
+                log_rho[i, e] = scale_kernel(data[i, e], ya, yb, kappa, precision[i, e], workspace, r, J)
 
 
 def closed_form_log_rho(
@@ -138,7 +138,7 @@ def closed_form_log_rho(
     weight: np.ndarray,
     frame: np.ndarray,
     edges: np.ndarray,
-    noise: PairNoise,
+    precision: np.ndarray,
     camera: Camera = PERSPECTIVE,
 ) -> np.ndarray:
     """log rho = log lambda + kappa (log beta_b - log beta_a) of every pair, shape (P, E); 0 where the weight is 0.
@@ -148,9 +148,9 @@ def closed_form_log_rho(
         weight: (P, E), only whether it is positive matters.
         frame: (P, F, 6) variables of every point and image; the log depth is not used.
         edges: (E, 2).
-        noise: sigmas of the blocks (its robust loss is not used).
+        precision: (P, E, 21) reciprocal standard deviations of the rows of every pair, 0 for rows that do not count.
         camera: camera model.
     """
     log_rho = np.zeros(weight.shape)
-    _scales(data, weight, frame, np.asarray(edges), camera.kappa, noise.precisions(), log_rho)
+    _scales(data, weight, frame, np.asarray(edges), camera.kappa, precision, log_rho)
     return log_rho

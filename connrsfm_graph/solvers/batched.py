@@ -58,7 +58,7 @@ def _point_cost(model, frame, log_scale, data, weight, edges, kappa, precision, 
             rows = _pair_rows(
                 model, data[e], frame[edges[e, 0]], frame[edges[e, 1]], log_scale[e], kappa, workspace, r, J, False
             )
-            cost += _whiten(r, rows, precision, weight[e], huber)[0]
+            cost += _whiten(r, rows, precision[e], weight[e], huber)[0]
     return cost
 
 
@@ -108,14 +108,14 @@ def linearise_point(
             continue
         a, b = edges[e, 0], edges[e, 1]
         rows = _pair_rows(model, data[e], frame[a], frame[b], log_scale[e], kappa, workspace, r, J, True)
-        _, robust = _whiten(r, rows, precision, weight[e], huber)
+        _, robust = _whiten(r, rows, precision[e], weight[e], huber)
         N[:] = 0.0
         g[:] = 0.0
         root = math.sqrt(weight[e]) * robust
         for k in range(rows):
-            if precision[k] == 0.0:
+            if precision[e, k] == 0.0:
                 continue
-            f = precision[k] * root
+            f = precision[e, k] * root
             for i in range(m):
                 row[i] = f * J[k, active[i]]
             s = r[k] * robust
@@ -266,7 +266,7 @@ def _minimise(
             columns,
             scaled,
             kappa,
-            precision,
+            precision[i],
             huber,
             limits,
             single,
@@ -335,7 +335,7 @@ class BatchedBackend:
             columns,
             scaled,
             problem.camera.kappa,
-            noise.precisions() if model == PairModel.CONFORMAL else np.ones(ROWS),
+            row_precisions(problem, noise, model),
             noise.huber,
             (settings.max_iterations, settings.tolerance, settings.damping),
             single,
@@ -347,6 +347,13 @@ class BatchedBackend:
         if self._structure is None or self._structure[:2] != (signature, problem.n_frames):
             self._structure = (signature, problem.n_frames, analyse(problem.n_frames, problem.edges))
         return self._structure[2]
+
+
+def row_precisions(problem: Problem, noise: PairNoise, model: PairModel) -> np.ndarray:
+    """(P, E, 21) reciprocal standard deviations of the rows; the isometric pair's first four are all 1."""
+    if model == PairModel.CONFORMAL:
+        return problem.row_precisions(noise)
+    return np.ones((problem.n_points, problem.n_edges, ROWS))
 
 
 def active_columns(active: tuple[str, ...], model: PairModel) -> tuple[np.ndarray, bool]:

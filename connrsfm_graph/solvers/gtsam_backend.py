@@ -57,7 +57,7 @@ def point_graph(
                 data,
                 state.pair(point, int(edge), (a, b)),
                 active=active,
-                noise=noise.model(weight),
+                noise=noise.model(weight, None if problem.precision is None else problem.precision[point, edge]),
                 camera=problem.camera,
                 checked=checked,
             )

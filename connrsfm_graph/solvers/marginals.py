@@ -11,10 +11,17 @@ import numpy as np
 from numba import njit, prange
 
 from connrsfm_graph.problem import Problem, State
-from connrsfm_graph.solvers.batched import active_columns, linearise_point, pair_scratch, point_equations, solve_point
+from connrsfm_graph.solvers.batched import (
+    active_columns,
+    linearise_point,
+    pair_scratch,
+    point_equations,
+    row_precisions,
+    solve_point,
+)
 from connrsfm_graph.solvers.block_cholesky import analyse
 from connrsfm_graph.solvers.interface import PairModel
-from factors.noise import ROWS, PairNoise
+from factors.noise import PairNoise
 
 
 def first_order_covariances(
@@ -45,7 +52,7 @@ def first_order_covariances(
         columns,
         scaled,
         problem.camera.kappa,
-        noise.precisions() if model == PairModel.CONFORMAL else np.ones(ROWS),
+        row_precisions(problem, noise, model),
         noise.huber,
         prior,
     )
@@ -73,7 +80,7 @@ def _marginals(
             columns,
             scaled,
             kappa,
-            precision,
+            precision[i],
             huber,
             pair_scratch(),
             H,

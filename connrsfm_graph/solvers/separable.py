@@ -14,7 +14,7 @@ second-order terms and scales of a point move together, which reaches the exact 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Literal
 
@@ -25,6 +25,7 @@ from connrsfm_graph.initialise import with_pair_scale
 from connrsfm_graph.integrate import Integrated, IntegrationConfig, balance_scales, integrate
 from connrsfm_graph.problem import Problem, State
 from connrsfm_graph.solvers.interface import Backend, Levenberg, Minimum
+from connrsfm_graph.solvers.row_noise import RowNoise, estimate_row_noise
 from factors.noise import PairNoise
 
 JOINT = ("d", "c", "s")
@@ -49,8 +50,12 @@ class SolveConfig:
     """N_t, rounds of steps 1 to 4; separable only."""
     restarts: int = 2
     """Rounds in which points start again from the surface through all points; joint only."""
+    sigmas: Literal["warps", "fixed"] = "fixed"
+    """Sigmas of the rows of every pair from the uncertainty of its warp and the misfit of the pre-step's surfaces, or
+    those of `noise` for all pairs."""
     noise: PairNoise = PairNoise(intrinsic=10.0, extrinsic=30.0)
-    """Sigmas of the metric, intrinsic and extrinsic rows, and the robust threshold."""
+    """Fixed sigmas of the metric, intrinsic and extrinsic rows (inf drops a block in either case), and the robust
+    threshold."""
     levenberg: Levenberg = Levenberg()
     """Settings of every minimisation."""
 
@@ -75,6 +80,12 @@ class Solved:
     """Total cost of the pair factors: at the start and after every outer iteration."""
     index_history: list[float] = field(default_factory=list)
     """Convergence index after every outer iteration: change of the cost relative to the cost before."""
+    row_noise: RowNoise | None = None
+    """Noise of the rows of every pair as estimated; None where it was fixed."""
+
+    def weighed(self, problem: Problem) -> Problem:
+        """The problem that was solved, with the precisions of its rows."""
+        return problem if self.row_noise is None else replace(problem, precision=self.row_noise.precision)
 
 
 def solve(
@@ -84,10 +95,32 @@ def solve(
     config: SolveConfig,
     integration: IntegrationConfig,
     progress: Callable[[int, int], None] | None = None,
+    covariance: np.ndarray | None = None,
 ) -> Solved:
-    """Run the configured schedule from the pre-step's state."""
-    if config.schedule == "separable":
-        return _separable(problem, start, backend, config, integration, progress)
+    """Run the configured schedule from the pre-step's state.
+
+    Args:
+        problem, start, backend, config, integration: the measurements, where to start, and how to solve.
+        progress: called with (rounds done, rounds).
+        covariance: (E, P, 10, 10) of the warps' jets, see `factors.warp_jet.WarpJet`; None where it is not known.
+    """
+    rows = None
+    if config.sigmas == "warps" and config.schedule != "none":
+        rows = estimate_row_noise(problem, covariance, start, config.noise)
+        problem = replace(problem, precision=rows.precision)
+    schedule = _separable if config.schedule == "separable" else _joint
+    return replace(schedule(problem, start, backend, config, integration, progress), row_noise=rows)
+
+
+def _joint(
+    problem: Problem,
+    start: State,
+    backend: Backend,
+    config: SolveConfig,
+    integration: IntegrationConfig,
+    progress: Callable[[int, int], None] | None,
+) -> Solved:
+    """All variables of a point together; the start itself where the schedule is `none`."""
     state, costs = start, []
     if config.schedule == "joint":
         costs.append(total_cost(problem, state, backend, config.noise))

@@ -52,7 +52,8 @@ def test_closed_form_scale_is_exact():
     frame = np.concatenate([scene.first_order, scene.second_order, scene.log_depth[..., None]], axis=-1)
     point_major = np.ascontiguousarray(data.transpose(1, 0, 2)), np.ascontiguousarray(frame.transpose(1, 0, 2))
     for noise in (PairNoise(), PairNoise(intrinsic=np.inf, extrinsic=np.inf), PairNoise(metric=np.inf)):
-        found = closed_form_log_rho(point_major[0], np.ones(data.shape[1::-1]), point_major[1], EDGES, noise)
+        precision = np.tile(noise.precisions(), (*data.shape[1::-1], 1))
+        found = closed_form_log_rho(point_major[0], np.ones(data.shape[1::-1]), point_major[1], EDGES, precision)
         assert found == pytest.approx(log_rho.T, abs=1e-9)
 
 

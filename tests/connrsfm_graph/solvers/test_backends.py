@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations
 
 import gtsam
@@ -24,7 +25,7 @@ from connrsfm_graph.solvers.interface import Levenberg, PairModel
 from connrsfm_graph.synthetic import spheres
 from factors.conformal_pair import ACTIVE
 from factors.keys import key
-from factors.noise import PairNoise
+from factors.noise import ROWS, PairNoise
 from factors.surface import CAMERAS, PERSPECTIVE, Camera
 
 BATCHED, GTSAM = BatchedBackend(), GtsamBackend()
@@ -59,6 +60,26 @@ def test_steps_agree(active, noise):
     assert np.abs(ours.frame - theirs.frame).max() < 1e-10
     assert np.abs(ours.log_scale - theirs.log_scale).max() < 1e-10
     assert np.abs(ours.frame - state.frame).max() + np.abs(ours.log_scale - state.log_scale).max() > 1e-3
+
+
+@pytest.mark.parametrize("noise", NOISES.values(), ids=NOISES.keys())
+@pytest.mark.parametrize("active", [("c",), ("d", "s"), ("d", "c", "s")], ids=["c", "ds", "dcs"])
+def test_steps_agree_with_a_precision_for_every_row(active, noise):
+    problem, state = random_problem()
+    plain = BATCHED.step(problem, state, active, noise, damping=0.01)
+    precision = np.random.default_rng(5).uniform(0.2, 5.0, size=(*problem.weight.shape, ROWS))
+    problem = replace(problem, precision=precision)
+    ours = BATCHED.step(problem, state, active, noise, damping=0.01)
+    theirs = GTSAM.step(problem, state, active, noise, damping=0.01)
+    assert np.abs(ours.frame - theirs.frame).max() < 1e-10
+    assert np.abs(ours.log_scale - theirs.log_scale).max() < 1e-10
+    assert np.abs(ours.frame - plain.frame).max() > 1e-3
+    # Points keep their precisions when they are solved on their own.
+    part = np.array([4, 1])
+    alone = BATCHED.step(
+        problem.points(part), State(state.frame[part], state.log_scale[part]), active, noise, damping=0.01
+    )
+    assert (alone.frame == ours.frame[part]).all()
 
 
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
