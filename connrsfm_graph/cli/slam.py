@@ -54,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=int,
         metavar="N",
         help="reconstruct the first N views together and take in the others one by one; N views must show the surface "
-        "from sides some tens of degrees apart (default: all together)",
+        "from sides some tens of degrees apart (default: all together; more than 1000 are fused one by one)",
     )
     parser.add_argument("--intrinsics", metavar="K", help="camera of the tracks, instead of the file's own")
     add_configuration(parser)
@@ -69,6 +69,7 @@ def run(arguments: argparse.Namespace) -> None:
     from connrsfm_graph.slam import FusionConfig, MapModel, SlamConfig, read_tum, save_problem, write_map, write_tum
     from connrsfm_graph.slam.cameras import STANDSTILL
     from connrsfm_graph.slam.drawing import write_drawing
+    from connrsfm_graph.slam.fuse import MOST_VIEWS
     from connrsfm_graph.slam.trajectory import steps_between
     from connrsfm_graph.tracks import load_tracks
 
@@ -86,7 +87,7 @@ def run(arguments: argparse.Namespace) -> None:
         raise InputError(f"{arguments.odometry}: holds {len(odometry)} poses, expected one per view, {tracks.n_frames}")
     steps, first = (None, None) if odometry is None else (steps_between(odometry), odometry[0])
     progress = Progress()
-    fusion = _all_together if arguments.live is None else _live
+    fusion = _all_together if arguments.live is None and tracks.n_frames <= MOST_VIEWS else _one_by_one
     background = None
     if arguments.background is not None:
         rigid = load_tracks(arguments.background, arguments.intrinsics)
@@ -127,7 +128,7 @@ def _all_together(
         return problem, solve_problem(problem, config.fusion, progress.update)
 
 
-def _live(
+def _one_by_one(
     arguments: argparse.Namespace,
     tracks: Tracks,
     config: SlamConfig,
@@ -136,21 +137,24 @@ def _live(
     background: tuple[np.ndarray, np.ndarray] | None,
     progress: Progress,
 ) -> tuple[FusionProblem, Fused]:
-    """The first views are reconstructed together, the others come one by one; all are let go of in the end."""
+    """The first views are reconstructed together, all are taken in one by one and, unless too many, let go of in the
+    end."""
     import numpy as np
 
     from connrsfm_graph.errors import InputError
     from connrsfm_graph.slam import FusionProblem, Sightings, fuse_live
+    from connrsfm_graph.slam.fuse import MOST_VIEWS
 
-    if not 3 <= arguments.live <= tracks.n_frames:
-        raise InputError(f"--live is {arguments.live}, expected 3 to {tracks.n_frames}, the number of views")
-    known = Sightings.of(_reconstruction(arguments, tracks.select(frames=range(arguments.live)), progress))
+    together = tracks.n_frames if arguments.live is None else arguments.live
+    if not 3 <= together <= tracks.n_frames:
+        raise InputError(f"--live is {together}, expected 3 to {tracks.n_frames}, the number of views")
+    known = Sightings.of(_reconstruction(arguments, tracks.select(frames=range(together)), progress))
     with progress.stage("views"):
         live = fuse_live(
             known, np.nan_to_num(tracks.normalised()), tracks.visible, config, steps, first, progress.update, background
         )
     with progress.stage("fusion"):
-        fused = live.fusion.finish()
+        fused = live.fusion.finish() if tracks.n_frames <= MOST_VIEWS else live.fusion.estimate()
     sightings, model = live.fusion.map.sightings(), config.fusion.map
     return FusionProblem(sightings, live.fusion.noise, model, live.fusion.graph, live.fusion.values), fused
 

@@ -133,7 +133,8 @@ def add_view(
         noise, model: as in `add_reconstruction`.
     """
     anchor_noise = model.anchor_noise(noise.image)
-    world = pose.transformFrom(np.exp(log_scale) * view.camera_points().T).T
+    # Not by `pose.transformFrom`, which returns a vector where there is one point.
+    world = pose.translation() + np.exp(log_scale) * view.camera_points() @ pose.rotation().matrix().T
     depth_std = np.where(np.isnan(view.depth_std), noise.depth, view.depth_std)
     for n, point in enumerate(view.points.tolist()):
         b, m = key(LOG_DEPTH, point, number), key(MAP_POINT, point, number)

@@ -121,7 +121,7 @@ def start_cameras(
         InputError: there is no odometry and a view shares fewer than four points with those before.
     """
     poses = np.tile(np.eye(4) if first is None else np.asarray(first, dtype=float), (sightings.n_views, 1, 1))
-    if steps is None or sigmas is None:
+    if steps is None or sigmas is None or not len(steps):
         log_scale = _chain_by_surface(sightings, poses)
     else:
         for view, step in enumerate(steps):

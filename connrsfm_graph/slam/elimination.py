@@ -127,8 +127,9 @@ class MapTerms:
         m = t[self.view] + distance * np.einsum("nij,nj->ni", R[self.view], rays)
         return MapState(R, t, g, self.log_depth.copy(), m)
 
+    @np.errstate(over="ignore", invalid="ignore")
     def cost(self, state: MapState) -> float:
-        """Half the sum of squares, anchors by Huber's loss."""
+        """Half the sum of squares, anchors by Huber's loss; no finite number where poses are beyond all bounds."""
         r, _ = self._anchors(state)
         norm = np.sqrt(self.image_weight * (r**2).sum(axis=1))
         loss = np.where(norm <= self.huber, 0.5 * norm**2, self.huber * (norm - 0.5 * self.huber))

@@ -30,6 +30,8 @@ from factors.keys import CAMERA_POSE, LOG_DEPTH, MAP_POINT, VIEW_SCALE, decode, 
 
 GAUGE_SIGMA = 1e-6
 """Standard deviation of the priors that fix the gauge."""
+MOST_VIEWS = 1000
+"""Views that are estimated together, at most: their dense equations take 2 GiB, which grows with the square."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,8 @@ class Fused:
     log_depth: np.ndarray
     """(F, P) log depth in the reconstruction's unit, NaN where not seen."""
     camera_covariance: np.ndarray
-    """(F, 7, 7) marginal covariance of each camera: rotation and translation in its own frame, log scale."""
+    """(F, 7, 7) marginal covariance of each camera: rotation and translation in its own frame, log scale; NaN where it
+    was not computed."""
     others: gtsam.Values
     """Every other variable of the given graph, such as rigid landmarks."""
     cost: float
@@ -98,11 +101,16 @@ def fuse(
             cameras start at the minimum of the given factors alone and the map from the measured depths.
 
     Raises:
-        InputError: a view sees nothing and no factor holds it, a pose or variable has no start, the graph holds
-            variables of the map, or its cost at the start is not a number.
+        InputError: there are more than `MOST_VIEWS` views, a view sees nothing and no factor holds it, a pose or
+            variable has no start, the graph holds variables of the map, or its cost at the start is not a number.
         ComputationError: the normal equations cannot be solved at any damping.
     """
     config = config or FusionConfig()
+    if sightings.n_views > MOST_VIEWS:
+        raise InputError(
+            f"fusion: {sightings.n_views} views are too many to be estimated together, expected up to {MOST_VIEWS}; "
+            "take them in one by one with IncrementalFusion"
+        )
     rest = _with_gauge(graph, values, sightings, noise)
     cameras = [k for view in range(sightings.n_views) for k in (pose_key(view), key(VIEW_SCALE, 0, view))]
     start = _start_values(rest, values, cameras)

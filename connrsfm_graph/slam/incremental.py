@@ -5,7 +5,7 @@ are minimised over, given the estimates of all before (`window`); whenever the s
 cameras are relaxed with the shapes given (`relaxation`), which takes time in proportion to the views, but ever more
 rarely. The work per view is bounded on average, whatever the length of the sequence. What remains above the minimum is
 in the shapes: with the default lag less than 0.1 % of the cost (`experiments.benchmarks.growth` measures it). `finish`
-lets go of everything and ends in the minimum of the batch fusion.
+lets go of everything and ends in the minimum of the batch fusion; of sequences too long for that, `estimate` is final.
 
 Nothing is stored before a view has been minimised over: whatever is wrong with it, the estimate is as it was before.
 """
@@ -20,7 +20,7 @@ import numpy as np
 from connrsfm_graph.errors import InputError
 from connrsfm_graph.metrics.alignment import align_similarity
 from connrsfm_graph.slam.assemble import MapModel, link_scales, pose_key
-from connrsfm_graph.slam.elimination import MapState, MapTerms
+from connrsfm_graph.slam.elimination import CAMERA, MapState, MapTerms
 from connrsfm_graph.slam.fuse import GAUGE_SIGMA, Fused, FusionConfig, fuse
 from connrsfm_graph.slam.growing_graph import GrowingGraph, push_back, try_out
 from connrsfm_graph.slam.growing_map import GrowingMap
@@ -28,7 +28,7 @@ from connrsfm_graph.slam.minimise import camera_arrays
 from connrsfm_graph.slam.noise import FusionNoise
 from connrsfm_graph.slam.relaxation import relaxed
 from connrsfm_graph.slam.sightings import Sightings, View
-from connrsfm_graph.slam.window import Window
+from connrsfm_graph.slam.window import Window, camera_keys
 from connrsfm_graph.solvers.interface import Levenberg
 from factors.keys import VIEW_SCALE, describe, key
 
@@ -184,8 +184,30 @@ class IncrementalFusion:
         links = [link_scales(n, n + 1, self.noise) for n in range(self.n_views - 1)]
         return terms.cost(state) + self.graph.error(self.values) + sum(link.error(self.values) for link in links)
 
+    def estimate(self) -> Fused:
+        """The current estimate of everything so far, without covariances."""
+        sightings, log_depth, points = self._estimate()
+        others = gtsam.Values(self.values)
+        for k in [k for view in range(self.n_views) for k in camera_keys(view)]:
+            others.erase(k)
+        cost = self.cost()
+        return Fused(
+            poses=np.array([self.pose(view) for view in range(self.n_views)]),
+            log_scale=np.array([self.log_scale(view) for view in range(self.n_views)]),
+            points=np.where(sightings.seen[..., None], points, np.nan),
+            log_depth=np.where(sightings.seen, log_depth, np.nan),
+            camera_covariance=np.full((self.n_views, CAMERA, CAMERA), np.nan),
+            others=others,
+            cost=cost,
+            cost_history=(cost,),
+        )
+
     def finish(self, config: FusionConfig | None = None) -> Fused:
-        """The batch fusion of everything so far, from the current estimate."""
+        """The batch fusion of everything so far, from the current estimate.
+
+        Raises:
+            InputError: there are more than `fuse.MOST_VIEWS` views; `estimate` has no such limit.
+        """
         config = config or FusionConfig(map=self.config.map)
         sightings, log_depth, points = self._estimate()
         return fuse(sightings, self.noise, self.graph, self.values, config, estimate=(log_depth, points))

@@ -67,9 +67,12 @@ def pose_problem(
         first: (4, 4) pose of the first view; the origin where None.
 
     Raises:
-        InputError: numbers of views do not fit, or views share too few points and there is no odometry.
+        InputError: no view sees a point, numbers of views do not fit, or views share too few points and there is no
+            odometry.
     """
     config = config or SlamConfig()
+    if not sightings.seen.any():
+        raise InputError("fusion: no view sees a point; give a reconstruction with points")
     noise = noise or estimate_noise(sightings)
     F = sightings.n_views
     if steps is not None and len(steps) != F - 1:

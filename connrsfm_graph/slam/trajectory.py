@@ -20,11 +20,12 @@ def read_tum(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     """Times (F,) and poses (F, 4, 4) of a TUM file.
 
     Raises:
-        InputError: the file cannot be read, or a line is not eight finite numbers with a quaternion that is not zero.
+        InputError: the file cannot be read, a line is not eight finite numbers with a quaternion that is not zero, or
+            times do not ascend.
     """
     path = Path(path)
     require_file(path)
-    rows = []
+    rows: list[np.ndarray] = []
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except UnicodeDecodeError as error:
@@ -38,6 +39,8 @@ def read_tum(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
             row = np.empty(0)
         if row.shape != (8,) or not np.isfinite(row).all() or not np.linalg.norm(row[4:]) > 0:
             raise InputError(f"{path}: line {number} is not time x y z qx qy qz qw")
+        if rows and not row[0] > rows[-1][0]:
+            raise InputError(f"{path}: line {number} is not later than the pose before, expected times that ascend")
         rows.append(row)
     if not rows:
         raise InputError(f"{path}: holds no pose, expected lines of time x y z qx qy qz qw")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pytest
 
 from connrsfm_graph.progress import Progress
 from connrsfm_graph.reconstruction import Reconstruction
-from connrsfm_graph.slam import load_problem, read_tum, solve_problem, trajectory_error, write_tum
+from connrsfm_graph.slam import Fused, load_problem, read_tum, solve_problem, trajectory_error, write_tum
 from connrsfm_graph.slam.trajectory import chained
 from connrsfm_graph.synthetic.passing_camera import noisy_odometry, passing_camera, relative_depth
 from connrsfm_graph.synthetic.scene import INTRINSICS
@@ -104,6 +105,18 @@ def test_views_one_by_one(connrsfm, files, scene, tmp_path):
         assert ended.status == 2
         assert message in ended.err
         assert "Traceback" not in ended.err
+
+
+def test_more_views_than_can_be_estimated_together_are_taken_in_one_by_one(
+    connrsfm, files, scene, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(sys.modules[Fused.__module__], "MOST_VIEWS", F - 1)
+    given = ("slam", files["tracks.npz"], "--result", files["result.npz"], "--odometry", files["odometry.tum"])
+    ended = connrsfm(*given, "--out", tmp_path / "out")
+    assert ended.status == 0, ended.err
+    _, poses = read_tum(tmp_path / "out" / "trajectory.tum")
+    _, odometry = read_tum(files["odometry.tum"])
+    assert trajectory_error(poses, scene.poses).ate < trajectory_error(odometry, scene.poses).ate
 
 
 def test_reconstructs_where_no_result_is_given(connrsfm, files, tmp_path):

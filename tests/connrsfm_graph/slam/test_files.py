@@ -52,6 +52,7 @@ def test_tum_round_trip(tmp_path):
         ("0 0 0 0 0 0 0 1\n1 2 3\n", "line 2 is not time x y z"),
         ("0 0 0 0 0 0 0 0\n", "line 1 is not"),
         ("0 0 nan 0 0 0 0 1\n", "line 1 is not"),
+        ("0 0 0 0 0 0 0 1\n\n0 1 0 0 0 0 0 1\n", "line 3 is not later"),
     ],
 )
 def test_bad_trajectories_are_named(tmp_path, text, message):

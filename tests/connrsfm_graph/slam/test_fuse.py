@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import gtsam
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from scipy.stats import chi2
 from connrsfm_graph.errors import InputError
 from connrsfm_graph.metrics.alignment import align_similarity
 from connrsfm_graph.slam import (
+    Fused,
     FusionConfig,
     FusionNoise,
     MapModel,
@@ -198,3 +201,31 @@ def test_fuse_names_what_is_missing():
     blind = Sightings.checked(case.sightings.image, case.sightings.log_depth, np.zeros((3, 8), dtype=bool))
     with pytest.raises(InputError, match="view 0 sees no point"):
         fuse(blind, NOISE, gtsam.NonlinearFactorGraph(), values)
+
+
+@pytest.mark.parametrize(("views", "points"), [(1, 8), (2, 8), (5, 1)])
+def test_the_smallest_problems_have_the_minimum_of_the_plain_graph(views, points):
+    case = posed(n_frames=5, n_points=8, gaps=0.0)
+    some = Sightings.checked(*(array[:views, :points] for array in _arrays(case.sightings)))
+    problem = pose_problem(some, noise=NOISE, steps=case.steps[: views - 1])
+    fused = fuse(some, NOISE, problem.graph, problem.values, FusionConfig(levenberg=TIGHT))
+    graph, _ = plain_graph(problem, MapModel())
+    if views == 1:  # without odometry the unit is the reconstruction's, held where it is
+        unit = gtsam.noiseModel.Isotropic.Sigma(1, GAUGE_SIGMA)
+        graph.add(gtsam.PriorFactorVector(key(VIEW_SCALE, 0, 0), np.zeros(1), unit))
+    assert graph.error(fused.values()) == pytest.approx(fused.cost, rel=1e-9, abs=1e-12)
+
+
+def _arrays(sightings):
+    return sightings.image, sightings.log_depth, sightings.seen, sightings.depth_std
+
+
+def test_nothing_seen_and_too_many_views_are_told(monkeypatch):
+    case = posed(n_frames=3, n_points=8)
+    problem = pose_problem(case.sightings, noise=NOISE, steps=case.steps)
+    monkeypatch.setattr(sys.modules[Fused.__module__], "MOST_VIEWS", 2)
+    with pytest.raises(InputError, match="3 views are too many to be estimated together, expected up to 2"):
+        solve_problem(problem)
+    nothing = Sightings.checked(*(array[:, :0] for array in _arrays(case.sightings)))
+    with pytest.raises(InputError, match="no view sees a point"):
+        pose_problem(nothing, noise=NOISE, steps=case.steps)

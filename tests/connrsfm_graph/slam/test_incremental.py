@@ -58,6 +58,16 @@ def test_view_by_view_ends_within_a_thousandth_of_the_batch():
     assert fused.cost < online < 1.001 * fused.cost
 
 
+def test_the_estimate_is_what_finish_starts_from():
+    case = posed(n_frames=8, n_points=12, gaps=0.3)
+    fusion = grown(case, lag=4)
+    estimate = fusion.estimate()
+    assert estimate.cost == pytest.approx(fusion.finish().cost_history[0], rel=1e-9)
+    np.testing.assert_array_equal(np.isfinite(estimate.points).all(axis=-1), case.sightings.seen)
+    np.testing.assert_allclose(estimate.points[5, case.sightings.view(5).points], fusion.map_points(5), rtol=1e-12)
+    assert estimate.others.size() == 0
+
+
 @pytest.mark.parametrize("motion", ["position", "velocity"])
 def test_relaxation_moves_cameras_and_keeps_shapes(motion):
     """With the early views held too early the unit is wrong; the relaxation mends most of it."""

@@ -83,6 +83,7 @@ def before_background():
     return scene, scene.background_image + IMAGE_SIGMA * rng.normal(size=scene.background_image.shape)
 
 
+@pytest.mark.slow
 def test_a_rigid_background_holds_the_camera(before_background, image):
     scene, rigid = before_background
     steps, _ = noisy_odometry(scene.poses, seed=5)
