@@ -36,7 +36,7 @@ def _triangle_normals(X, triangles, normal):
 
 @njit(cache=True, inline="always")
 def solved(A, b):
-    """A^-1 b in the place of b, by Cholesky in the place of A, symmetric and positive definite."""
+    """A^-1 b in the place of b, by Cholesky in the place of A, the lower triangle of a positive definite matrix."""
     n = len(b)
     for r in range(n):
         for c in range(r + 1):
@@ -104,7 +104,7 @@ def _quadrics(X, triangles, edges, normal, axis, curvature):
             weight = 1.0 / max(x * x + y * y, 1e-4)
             for r in range(5):
                 b[p, r] += weight * row[r] * h
-                for c in range(5):
+                for c in range(r + 1):
                     A[p, r, c] += weight * row[r] * row[c]
     for i in range(P):
         for r in range(5):

@@ -8,7 +8,7 @@
 Each view's H_f is factored by Cholesky inside its envelope: row r is stored from its first non-zero column on, and
 points are ordered by a sweep across the surface, so rows are short. The cost is linear in views. The Schur complement
 S = D - sum_f W_f' H_f^-1 W_f on the lengths is dense, so it is never formed: conjugate gradients apply it by one
-forward and backward substitution per view.
+forward and backward substitution per view. Several right-hand sides at once read each view's factor once for all.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class NormalEquations:
 
 
 @njit(cache=True, inline="always")
-def _spread(border, weight, ends, v, x):
+def spread_view(border, weight, ends, v, x):
     """x += W v for one view, from lengths to unknowns."""
     m = border.shape[1] // 2
     for e in range(len(v)):
@@ -67,26 +67,29 @@ def _gather(border, weight, ends, x, v):
 
 @njit(cache=True, nogil=True)
 def _spread_all(begin, end, border, weight, ends, v, x):
-    """x_f += W_f v_f for views begin to end - 1."""
+    """x_sf += W_f v_sf for views begin to end - 1."""
     for f in range(begin, end):
-        _spread(border[f], weight[f], ends, v[f], x[f])
+        for s in range(len(x)):
+            spread_view(border[f], weight[f], ends, v[s, f], x[s, f])
 
 
 @njit(cache=True, nogil=True)
 def _gather_all(begin, end, border, weight, ends, x, out):
-    """out_f = W_f' x_f for views begin to end - 1."""
+    """out_fs = W_f' x_sf for views begin to end - 1."""
     for f in range(begin, end):
-        _gather(border[f], weight[f], ends, x[f], out[f])
+        for s in range(len(x)):
+            _gather(border[f], weight[f], ends, x[s, f], out[f, s])
 
 
 @njit(cache=True, nogil=True)
 def _schur_terms(begin, end, factor, first, start, border, weight, ends, v, out):
-    """out_f = W_f' H_f^-1 W_f v for views begin to end - 1."""
+    """out_fs = W_f' H_f^-1 W_f v_s for views begin to end - 1."""
     for f in range(begin, end):
-        x = np.zeros(len(first))
-        _spread(border[f], weight[f], ends, v, x)
-        substitute(factor[f], first, start, x)
-        _gather(border[f], weight[f], ends, x, out[f])
+        for s in range(len(v)):
+            x = np.zeros(len(first))
+            spread_view(border[f], weight[f], ends, v[s], x)
+            substitute(factor[f], first, start, x)
+            _gather(border[f], weight[f], ends, x, out[f, s])
 
 
 class Factorised:
@@ -115,60 +118,65 @@ class Factorised:
             raise ComputationError("refinement: the normal equations of a view are not positive definite")
 
     def solve_views(self, x: np.ndarray) -> np.ndarray:
-        """H_f^-1 x_f for all views, shape (F, n)."""
+        """H_f^-1 x_f for all views, shape (S, F, n)."""
         x = x.copy()
-        over_views(solve_kernel, len(x), self.factor, self.envelope.first, self.envelope.start, x)
+        over_views(solve_kernel, x.shape[1], self.factor, self.envelope.first, self.envelope.start, x)
         return x
 
     def spread(self, v: np.ndarray) -> np.ndarray:
-        """W_f v_f for all views, shape (F, n), from (F, E) or from (E,), the same for all."""
-        x = np.zeros_like(self.equations.gradient)
-        v = np.broadcast_to(v, self.equations.weight.shape)
-        over_views(_spread_all, len(x), self.equations.border, self.equations.weight, self.ends, v, x)
+        """W_f v_f for all views, shape (S, F, n), from (S, F, E) or from (S, 1, E), the same for all views."""
+        (F, n), E = self.equations.gradient.shape, v.shape[-1]
+        x, v = np.zeros((len(v), F, n)), np.broadcast_to(v, (len(v), F, E))
+        over_views(_spread_all, F, self.equations.border, self.equations.weight, self.ends, v, x)
         return x
 
     def gather(self, x: np.ndarray) -> np.ndarray:
-        """sum_f W_f' x_f, shape (E,), from (F, n)."""
-        out = np.empty_like(self.equations.weight)
-        over_views(_gather_all, len(x), self.equations.border, self.equations.weight, self.ends, x, out)
+        """sum_f W_f' x_f, shape (S, E), from (S, F, n)."""
+        F, E = self.equations.weight.shape
+        out = np.empty((F, len(x), E))
+        over_views(_gather_all, F, self.equations.border, self.equations.weight, self.ends, x, out)
         return out.sum(axis=0)
 
     def schur_product(self, v: np.ndarray) -> np.ndarray:
-        """S v."""
+        """S v, shape (S, E)."""
         e = self.equations
-        out = np.empty_like(e.weight)
+        out = np.empty((len(e.weight), *v.shape))
         over_views(_schur_terms, len(out), self.factor, *self.envelope[:2], e.border, e.weight, self.ends, v, out)
-        return self.diagonal * v + e.unit**2 * v.mean() / len(v) - out.sum(axis=0)
+        return self.diagonal * v + e.unit**2 * v.mean(axis=1, keepdims=True) / v.shape[1] - out.sum(axis=0)
 
     def solve_lengths(self, rhs: np.ndarray, tolerance: float, limit: int = 500) -> np.ndarray:
-        """S^-1 rhs by conjugate gradients preconditioned with D, to a relative `tolerance` or `limit` products."""
+        """S^-1 rhs, shape (S, E), by conjugate gradients preconditioned with D.
+
+        Each right-hand side on its own, to a relative `tolerance` or `limit` products.
+        """
         v, residual = np.zeros_like(rhs), rhs.copy()
-        z = residual / self.diagonal
-        direction = z.copy()
-        size = goal = float(residual @ z)
-        goal *= tolerance**2
+        direction = residual / self.diagonal
+        size = (residual * direction).sum(axis=1)
+        goal = tolerance**2 * size
         for _ in range(limit):
-            if not size > goal:
+            active = np.flatnonzero(size > goal)
+            if len(active) == 0:
                 break
-            product = self.schur_product(direction)
-            curvature = float(direction @ product)
-            if not curvature > 0.0:
-                break
-            v += size / curvature * direction
-            residual -= size / curvature * product
-            z = residual / self.diagonal
-            size, last = float(residual @ z), size
-            direction = z + size / last * direction
+            product = self.schur_product(direction[active])
+            curvature = (direction[active] * product).sum(axis=1)
+            goal[active[~(curvature > 0.0)]] = np.inf  # rounding is all that is left
+            part = np.divide(size[active], curvature, out=np.zeros_like(curvature), where=curvature > 0.0)[:, None]
+            v[active] += part * direction[active]
+            residual[active] -= part * product
+            z = residual[active] / self.diagonal
+            last, size[active] = size[active], (residual[active] * z).sum(axis=1)
+            direction[active] = z + (size[active] / last)[:, None] * direction[active]
         return v
 
     def step(self, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
         """Gauss-Newton step: (F, n) of the views' unknowns and (E,) of the lengths."""
-        return self.solve(self.equations.gradient, self.equations.length_gradient, tolerance)
+        views, lengths = self.solve(self.equations.gradient[None], self.equations.length_gradient[None], tolerance)
+        return views[0], lengths[0]
 
     def solve(
         self, gradient: np.ndarray, length_gradient: np.ndarray, tolerance: float
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Minus the inverse of the whole matrix times (F, n) and (E,)."""
+        """Minus the inverse of the whole matrix times (S, F, n) and (S, E)."""
         inner = self.solve_views(gradient)
         lengths = self.solve_lengths(self.gather(inner) - length_gradient, tolerance)
-        return -inner - self.solve_views(self.spread(lengths)), lengths
+        return -inner - self.solve_views(self.spread(lengths[:, None])), lengths

@@ -62,9 +62,10 @@ def _dot(a, b):
 @njit(cache=True, inline="always")
 def _factor_view(A, first, start):
     """Cholesky factor in place; false where A is not positive definite. Rows left over by tiles go one by one."""
+    inverse = np.empty(len(first))  # of the diagonal: divisions would take as long as the sums
     whole = len(first) // _TILE * _TILE
     for R in range(0, whole, _TILE):
-        if not _factor_tile(A, first, start, R):
+        if not _factor_tile(A, first, start, R, inverse):
             return False
     for r in range(whole, len(first)):
         row = A[start[r] : start[r + 1]]
@@ -83,7 +84,7 @@ def _factor_view(A, first, start):
 
 
 @njit(cache=True, inline="always")
-def _factor_tile(A, first, start, R):
+def _factor_tile(A, first, start, R, inverse):
     """Rows R to R + 2 of the factor: three rows and three columns at a time read every number once for three products.
 
     With L_C the 3 x 3 diagonal block of a tile of columns and s the products of what lies left of it, the block below
@@ -109,9 +110,10 @@ def _factor_tile(A, first, start, R):
             s20 += a2[k] * b0[k]
             s21 += a2[k] * b1[k]
             s22 += a2[k] * b2[k]
-        _below(a0, size, s00, s01, s02, b0, b1, b2)
-        _below(a1, size, s10, s11, s12, b0, b1, b2)
-        _below(a2, size, s20, s21, s22, b0, b1, b2)
+        of_tile = inverse[C : C + 3]
+        _below(a0, size, s00, s01, s02, b1, b2, of_tile)
+        _below(a1, size, s10, s11, s12, b1, b2, of_tile)
+        _below(a2, size, s20, s21, s22, b1, b2, of_tile)
     m = R - low
     s00 = s10 = s11 = s20 = s21 = s22 = 0.0
     for k in range(m):
@@ -125,26 +127,33 @@ def _factor_tile(A, first, start, R):
     if not pivot > 0.0:
         return False
     x0[m] = np.sqrt(pivot)
-    x1[m] = (x1[m] - s10) / x0[m]
+    inverse[R] = 1.0 / x0[m]
+    x1[m] = (x1[m] - s10) * inverse[R]
     pivot = x1[m + 1] - s11 - x1[m] ** 2
     if not pivot > 0.0:
         return False
     x1[m + 1] = np.sqrt(pivot)
-    x2[m] = (x2[m] - s20) / x0[m]
-    x2[m + 1] = (x2[m + 1] - s21 - x2[m] * x1[m]) / x1[m + 1]
+    inverse[R + 1] = 1.0 / x1[m + 1]
+    x2[m] = (x2[m] - s20) * inverse[R]
+    x2[m + 1] = (x2[m + 1] - s21 - x2[m] * x1[m]) * inverse[R + 1]
     pivot = x2[m + 2] - s22 - x2[m] ** 2 - x2[m + 1] ** 2
     if not pivot > 0.0:
         return False
     x2[m + 2] = np.sqrt(pivot)
+    inverse[R + 2] = 1.0 / x2[m + 2]
     return True
 
 
 @njit(cache=True, inline="always")
-def _below(row, at, s0, s1, s2, b0, b1, b2):
-    """Three entries of a row from `at` on: (row - s) L^-T, L the lower triangle of the rows b from `at` on."""
-    row[at] = (row[at] - s0) / b0[at]
-    row[at + 1] = (row[at + 1] - s1 - row[at] * b1[at]) / b1[at + 1]
-    row[at + 2] = (row[at + 2] - s2 - row[at] * b2[at] - row[at + 1] * b2[at + 1]) / b2[at + 2]
+def _below(row, at, s0, s1, s2, b1, b2, inverse):
+    """Three entries of a row from `at` on: (row - s) L^-T, L the lower triangle of the rows b from `at` on.
+
+    `inverse` (3,) holds one over the diagonal of L.
+    """
+    x0 = (row[at] - s0) * inverse[0]
+    x1 = (row[at + 1] - s1 - x0 * b1[at]) * inverse[1]
+    row[at], row[at + 1] = x0, x1
+    row[at + 2] = (row[at + 2] - s2 - x0 * b2[at] - x1 * b2[at + 1]) * inverse[2]
 
 
 @njit(cache=True, nogil=True, fastmath=_SUMS)
@@ -177,30 +186,9 @@ def substitute(L, first, start, x):
             above[k] -= left[k] * s
 
 
-@njit(cache=True, nogil=True, fastmath=_SUMS)
-def substitute_many(L, first, start, y):
-    """The same for several right-hand sides at once, y (n, R)."""
-    n, R = y.shape
-    for r in range(n):
-        row = y[r]
-        for c in range(first[r], r):
-            value, other = L[start[r] + c - first[r]], y[c]
-            for k in range(R):
-                row[k] -= value * other[k]
-        for k in range(R):
-            row[k] /= L[start[r + 1] - 1]
-    for r in range(n - 1, -1, -1):
-        row = y[r]
-        for k in range(R):
-            row[k] /= L[start[r + 1] - 1]
-        for c in range(first[r], r):
-            value, other = L[start[r] + c - first[r]], y[c]
-            for k in range(R):
-                other[k] -= value * row[k]
-
-
 @njit(cache=True, nogil=True)
 def solve_kernel(begin, end, factor, first, start, x):
-    """x_f = H_f^-1 x_f in place for views begin to end - 1."""
+    """x_sf = H_f^-1 x_sf in place for views begin to end - 1 and all right-hand sides, x (S, F, n)."""
     for f in range(begin, end):
-        substitute(factor[f], first, start, x[f])
+        for s in range(len(x)):
+            substitute(factor[f], first, start, x[s, f])

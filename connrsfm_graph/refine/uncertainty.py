@@ -10,18 +10,21 @@ tilts surfaces much more than independent noise of the same size.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import islice
 
 import numpy as np
 from numba import njit
 
 from connrsfm_graph.refine.cost import linearise_view
-from connrsfm_graph.refine.elimination import Factorised
-from connrsfm_graph.refine.envelope import factor_damped, substitute_many
+from connrsfm_graph.refine.elimination import Factorised, spread_view
+from connrsfm_graph.refine.envelope import factor_damped, substitute
 from connrsfm_graph.refine.mesh import Mesh
 from connrsfm_graph.refine.solve import Measurements, Shape, kernel_arguments, lag, linearise
 from connrsfm_graph.threads import over_views
 
 _SAMPLES = 20
+_AT_ONCE = 5
+"""Samples that are solved together."""
 _TOLERANCE = 0.03
 """Relative accuracy of the linear solutions, well below that of a deviation from so few draws."""
 _SMOOTHINGS = 4
@@ -56,12 +59,13 @@ def _variance_of_all(
     factorised = Factorised(equations, envelope, measurements.mesh.edges)
     rays = envelope.unknown[:, None] + np.array([1, 2])
     square = np.zeros_like(shape.log_depth)
-    for lengths, image in draws:
+    for _ in range(_SAMPLES // _AT_ONCE):
+        lengths, images = (np.stack(parts) for parts in zip(*islice(draws, _AT_ONCE), strict=True))
         noise = lengths / measurements.length_weight
         gradient = -factorised.spread(noise)
-        gradient[:, rays] += measurements.image_weight[..., None] * image
-        views, _ = factorised.solve(gradient, -(equations.weight * noise).sum(axis=0), _TOLERANCE)
-        square += views[:, envelope.unknown] ** 2
+        gradient[..., rays] += measurements.image_weight[..., None] * images
+        views, _ = factorised.solve(gradient, -(equations.weight * noise).sum(axis=1), _TOLERANCE)
+        square += (views[..., envelope.unknown] ** 2).sum(axis=0)
     return square / _SAMPLES
 
 
@@ -86,35 +90,32 @@ def _variance_kernel(
 
     Arguments up to `envelope` are those of `linearise_kernel`, `lengths` (S, E) and `images` (S, P, 2) the draws.
     """
-    edges, unknown = terms.edges, envelope.unknown
-    n, E, S = len(envelope.first), len(edges), len(lengths)
-    m = n // len(unknown)
+    unknown = envelope.unknown
+    n, E, m = len(envelope.first), len(terms.edges), len(envelope.first) // len(unknown)
+    ends = np.empty((E, 2), np.int64)
+    for e in range(E):
+        ends[e, 0], ends[e, 1] = unknown[terms.edges[e, 0]], unknown[terms.edges[e, 1]]
     matrix, gradient, border = np.empty(envelope.start[-1]), np.empty(n), np.empty((E, 2 * m))
-    residual, weight = np.empty(E), np.empty(E)
-    errors = np.empty((n, S))
+    residual, weight, noise = np.empty(E), np.empty(E), np.empty(E)
     for v in range(first, last):
         linearise_view(
             X[v], f[v], drift[v], offset[v], correction[v], image_weight[v], length_weight[v], factor_weight[v], terms,
             envelope, matrix, gradient, border, residual, weight,
         )  # fmt: skip
+        square[v] = 0.0
         if not factor_damped(matrix, 0.0, envelope.first, envelope.start):
             square[v] = np.nan
-            continue
-        errors[:] = 0.0
-        for e in range(E):
-            scaled = weight[e] / length_weight[v, e]
-            for end in range(2):
-                at = unknown[edges[e, end]]
-                for c in range(m):
-                    for k in range(S):
-                        errors[at + c, k] += scaled * border[e, end * m + c] * lengths[k, e]
-        for i in range(len(unknown)):
-            for c in range(2):
-                for k in range(S):
-                    errors[unknown[i] + 1 + c, k] += image_weight[v, i] * images[k, i, c]
-        substitute_many(matrix, envelope.first, envelope.start, errors)
-        for i in range(len(unknown)):
-            square[v, i] = (errors[unknown[i]] ** 2).mean()
+        for s in range(len(lengths)):
+            gradient[:] = 0.0
+            for e in range(E):
+                noise[e] = -lengths[s, e] / length_weight[v, e]
+            spread_view(border, weight, ends, noise, gradient)
+            for i in range(len(unknown)):
+                gradient[unknown[i] + 1] += image_weight[v, i] * images[s, i, 0]
+                gradient[unknown[i] + 2] += image_weight[v, i] * images[s, i, 1]
+            substitute(matrix, envelope.first, envelope.start, gradient)
+            for i in range(len(unknown)):
+                square[v, i] += gradient[unknown[i]] ** 2 / len(lengths)
 
 
 def _draws(rng: np.random.Generator, drawn: int, mesh: Mesh, stretch: bool) -> Iterator[tuple[np.ndarray, np.ndarray]]:
