@@ -153,6 +153,9 @@ def _one_by_one(
         live = fuse_live(
             known, np.nan_to_num(tracks.normalised()), tracks.visible, config, steps, first, progress.update, background
         )
+    if live.held:
+        views = f"views {', '.join(map(str, live.held))} show" if len(live.held) > 1 else f"view {live.held[0]} shows"
+        print(f"{views} too little of the surface; odometry places the camera there")
     with progress.stage("fusion"):
         fused = live.fusion.finish() if tracks.n_frames <= MOST_VIEWS else live.fusion.estimate()
     sightings, model = live.fusion.map.sightings(), config.fusion.map

@@ -61,6 +61,8 @@ class LiveFusion:
         distance = float(np.median(np.exp(first.log_depth[first.seen] + log_scale)))
         self.background = GrowingBackground(noise.image, distance)
         """What the views saw of points that do not move."""
+        self.held: list[int] = []
+        """Views that showed too little of the surface."""
         for number in range(first.n_views):
             step, deviations = None, None
             if number and steps is not None and sigmas is not None:
@@ -97,6 +99,23 @@ class LiveFusion:
             raise InputError(f"view {self.fusion.n_views}: {error}; the view was not added") from error
         return self._take_in(view, step, sigmas, factors, values, rigid)
 
+    def hold(self, step: np.ndarray, sigmas: np.ndarray, rigid: tuple[np.ndarray, np.ndarray] | None = None) -> int:
+        """Take in a view that shows too little of the surface: odometry and background place its camera.
+
+        Args:
+            step, sigmas, rigid: as in `add`.
+
+        Returns:
+            Number of the view.
+
+        Raises:
+            InputError: the view cannot be used; the message says why and everything is as it was before.
+        """
+        nothing = View.checked(np.empty(0, dtype=int), np.empty((0, 2)), np.empty(0))
+        number = self._take_in(nothing, step, sigmas, rigid=rigid)
+        self.held.append(number)
+        return number
+
     def _take_in(
         self,
         view: View,
@@ -124,7 +143,8 @@ class LiveFusion:
         self.fusion.add_view(view, step, sigmas, factors, values)
         if rigid is not None:
             self.background.take_in(number, *rigid)
-        self.keyframes.offer(view)
+        if len(view.points):
+            self.keyframes.offer(view)
         return number
 
 
@@ -148,6 +168,8 @@ def fuse_live(
     background: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> LiveFusion:
     """Take in a recorded sequence view by view, with noise levels from its first views.
+
+    Where there is odometry, views that show too little of the surface are held by it and the background.
 
     Args:
         first: reconstruction of the first K views.
@@ -181,8 +203,14 @@ def fuse_live(
     )
     for view in range(K, F):
         (points,) = np.nonzero(visible[view])
-        step, deviations = (None, None) if steps is None or sigmas is None else (steps[view - 1], sigmas[view - 1])
-        live.add(points, image[view, points], step, deviations, rigid=_sighted(background, view))
+        if steps is None or sigmas is None:
+            live.add(points, image[view, points], rigid=_sighted(background, view))
+        else:
+            odometry = steps[view - 1], sigmas[view - 1]
+            try:
+                live.add(points, image[view, points], *odometry, rigid=_sighted(background, view))
+            except InputError:  # whatever is wrong with more than the surface is told once more
+                live.hold(*odometry, _sighted(background, view))
         if progress is not None:
             progress(view + 1, F)
     return live

@@ -128,3 +128,15 @@ def test_a_background_that_cannot_be_used_changes_nothing(before_background, ima
         good = landmarks, rigid[K, landmarks]
         assert estimate.add(points, image[K, points], steps[K - 1], odometry[K - 1], rigid=good) == K
     np.testing.assert_array_equal(live.fusion.pose(K), twin.fusion.pose(K))
+
+
+def test_a_view_that_shows_too_little_of_the_surface_is_held_by_odometry(scene, image):
+    steps, _ = noisy_odometry(scene.poses, seed=5)
+    first, seen = first_views(scene, image, scene.visible), scene.visible.copy()
+    seen[K + 1, 5:] = False
+    live = fuse_live(first, image[: K + 3], seen[: K + 3], None, steps[: K + 2], scene.poses[0])
+    assert live.held == [K + 1]
+    assert len(live.fusion.map.views[K + 1].points) == 0
+    np.testing.assert_allclose(live.fusion.pose(K + 1), live.fusion.pose(K) @ steps[K], atol=0.05)
+    with pytest.raises(InputError, match=f"view {K + 1}: it shares fewer than 10 tracks"):
+        fuse_live(first, image, seen, pose=scene.poses[0])
