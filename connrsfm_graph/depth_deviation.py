@@ -8,7 +8,9 @@ neighbours share: every point fits its own pairs well, and integration adds the 
 sequence is therefore estimated from what the surfaces say about each other: a length between two points should be the
 same in all images, up to the scale of each image. Lengths of all sizes are compared, since errors grow over the
 surface. Of what they differ by, the noise of the image points explains a part and the depths the rest. A surface that
-stretches makes its depths look less sure than they are; errors that all images have in common cannot be seen.
+stretches makes its depths look less sure than they are, and so do chords across a bend where the depths themselves are
+small (orthographic cameras); errors that all images have in common cannot be seen. On simulated isometric surfaces the
+mean normalised squared error is 1 within its 95 % interval (tests).
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ from connrsfm_graph.solvers.marginals import first_order_covariances
 from connrsfm_graph.solvers.separable import SolveConfig, Solved, active_variables
 from factors.isometric_pair import ISOMETRIC_ROWS
 
-_LENGTHS = 1000
+_LENGTHS = 400
 """Lengths that are compared over the images."""
 _ROUNDS = 5
 """Rounds in which lengths and the images' scales are made to agree."""
