@@ -149,10 +149,13 @@ def _one_by_one(
     if not 3 <= together <= tracks.n_frames:
         raise InputError(f"--live is {together}, expected 3 to {tracks.n_frames}, the number of views")
     known = Sightings.of(_reconstruction(arguments, tracks.select(frames=range(together)), progress))
-    with progress.stage("views"):
-        live = fuse_live(
-            known, np.nan_to_num(tracks.normalised()), tracks.visible, config, steps, first, progress.update, background
-        )
+    image = np.nan_to_num(tracks.normalised())
+    try:
+        with progress.stage("views"):
+            live = fuse_live(known, image, tracks.visible, config, steps, first, progress.update, background)
+    except InputError as error:
+        mend = "" if steps is not None else "; give odometry, or leave the view out"
+        raise InputError(f"{arguments.tracks}: {error}{mend}") from error
     if live.held:
         views = f"views {', '.join(map(str, live.held))} show" if len(live.held) > 1 else f"view {live.held[0]} shows"
         print(f"{views} too little of the surface; odometry places the camera there")

@@ -97,6 +97,18 @@ def test_views_one_by_one(connrsfm, files, scene, tmp_path):
     assert ended.status == 0, ended.err
     _, held = read_tum(tmp_path / "held" / "trajectory.tum")
     assert trajectory_error(held, scene.poses).rpe_rotation_deg < trajectory_error(poses, scene.poses).rpe_rotation_deg
+    with np.load(files["tracks.npz"]) as arrays:
+        visible = np.ones((F, P), dtype=bool)
+        visible[12, 3:] = False
+        np.savez(tmp_path / "lost.npz", **arrays, visible=visible)
+    lost = ("slam", tmp_path / "lost.npz", "--result", tmp_path / "ten.npz", "--live", "10", "--out", tmp_path / "lost")
+    ended = connrsfm(*lost)
+    assert ended.status == 2
+    assert "lost.npz: view 12: it shares fewer than 10 tracks with every keyframe" in ended.err
+    assert "give odometry, or leave the view out" in ended.err
+    ended = connrsfm(*lost, "--odometry", files["odometry.tum"])
+    assert ended.status == 0, ended.err
+    assert "view 12 shows too little of the surface" in ended.out
     for more, message in (
         (("--live", "2"), "--live is 2, expected 3 to 15"),
         (("--live", "11"), "holds 10 images and 30 points, expected"),
