@@ -5,7 +5,8 @@
     parallel    one thread, all threads, all processes
 
 Each writes NAME.csv and NAME.md, row by row; a row that is there is not measured again. Figures are to be compared
-within one run on a machine that does nothing else. All of them take about 20 minutes on two cores.
+within one run on a machine that does nothing else. All of them take about ten minutes on two cores, the first run of
+an installation one more, for it compiles. `publish` after them puts what was measured into the pages that show it.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from pathlib import Path
 
 from experiments.benchmarks.iteration import measure_iteration
 from experiments.benchmarks.pipeline import SIZES, measure_parallel, measure_pipeline
+from experiments.benchmarks.publish import publish
 
 BENCHMARKS: dict[str, Callable[[Path], None]] = {
     "iteration": measure_iteration,
@@ -32,7 +34,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("names", nargs="*", choices=[*BENCHMARKS, []], metavar="NAME", help=", ".join(BENCHMARKS))
+    parser.add_argument(
+        "names",
+        nargs="*",
+        choices=[*BENCHMARKS, "publish", []],
+        metavar="NAME",
+        help=", ".join([*BENCHMARKS, "publish"]),
+    )
     parser.add_argument("--out", type=Path, default=Path("results/benchmarks"), help="folder (default: %(default)s)")
     parser.add_argument(
         "--sizes", type=_size, nargs="+", metavar="FxP", default=SIZES, help="images x points of the pipeline"
@@ -42,6 +50,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name in given.names or BENCHMARKS:
         if name == "pipeline":
             measure_pipeline(given.out, given.sizes)
+        elif name == "publish":
+            publish(given.out)
         else:
             BENCHMARKS[name](given.out)
     print(f"{(time.perf_counter() - started) / 60:.1f} minutes, tables in {given.out}")

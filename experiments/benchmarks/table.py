@@ -10,6 +10,7 @@ import csv
 import os
 import platform
 from collections.abc import Callable, Mapping
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 
@@ -74,7 +75,17 @@ def machine() -> str:
         model = names[0] if names else model
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
     versions = ", ".join(f"{name} {metadata.version(name)}" for name in ("numpy", "scipy", "numba", "gtsam"))
-    return f"{model}, {cores()} cores, {memory:.0f} GiB; Python {platform.python_version()}, {versions}"
+    return f"{model}, {cores()} cores, {memory:.0f} GiB, {gpu()}; Python {platform.python_version()}, {versions}"
+
+
+@cache
+def gpu() -> str:
+    """The graphics processor that torch would use, or that there is none."""
+    try:
+        import torch
+    except ImportError:
+        return "no torch and so no GPU"
+    return torch.cuda.get_device_name() if torch.cuda.is_available() else "no GPU"
 
 
 def _read(text: str) -> str | int | float:

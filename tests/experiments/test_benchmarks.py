@@ -7,9 +7,11 @@ import csv
 import numpy as np
 import pytest
 
+from connrsfm_graph.errors import InputError
 from connrsfm_graph.solvers.batched import BatchedBackend
 from experiments.benchmarks.__main__ import main
 from experiments.benchmarks.iteration import ACTIVE, DAMPING, NOISE, bending_problem, measure_iteration
+from experiments.benchmarks.publish import MARKS, publish
 from experiments.benchmarks.table import FAILURE, Table, machine
 from factors.conformal_pair import SLOTS
 
@@ -40,6 +42,30 @@ def test_torch_takes_the_same_step(active):
     columns = [column for letter in "dc" if letter in active for column in range(*SLOTS[letter][0])]
     step = make_step(problem, state, active, NOISE, DAMPING)().numpy()
     np.testing.assert_allclose(step, (after.frame - state.frame)[..., columns], atol=1e-8)
+
+
+def test_pages_show_what_was_measured(tmp_path):
+    pages = [tmp_path / "page.md", tmp_path / "project.md"]
+    for page in pages:
+        page.write_text("before\n" + "\nold\n".join(MARKS) + "\nafter\n")
+    with pytest.raises(InputError, match="holds no benchmark"):
+        publish(tmp_path, *pages)
+    sizes, solvers = Table(tmp_path, "pipeline", ("images", "points")), Table(tmp_path, "iteration", ("solver",))
+    row = {"seconds": 2.5, "peak MiB": 512, "3D error %": 0.001}
+    sizes.measure({"images": 10, "points": 85}, lambda: row)
+    sizes.write({"s": lambda row: str(row["seconds"])})
+    for times, solver in ((1, "batched"), (42, "GTSAM"), (540, "scipy TRF per point")):
+        joint = {"iteration": "joint", "images": 9, "points": 8, "seconds": 0.5 * times, "times batched": times}
+        solvers.measure({"solver": solver}, lambda joint=joint: joint)
+    solvers.write({"s": lambda row: str(row["seconds"])})
+    publish(tmp_path, *pages)
+    tables, sentences = (page.read_text() for page in pages)
+    assert all(
+        "old" not in text and text.startswith("before") and text.endswith("after\n") for text in (tables, sentences)
+    )
+    assert tables.index("benchmarks pipeline`: " + machine()) < tables.index("| 2.5 |") < tables.index("| 270.0 |")
+    assert "10 x 85 in 2.5 s" in sentences
+    assert "in GTSAM 42 times, scipy's TRF per point 540 times that" in " ".join(sentences.split())
 
 
 @pytest.mark.slow
