@@ -55,7 +55,7 @@ def depth_deviation(
     covariance = _of_terms(problem, solved, config)
     bending = solved.integrated.bending
     image_sigma = image_sigma if np.isfinite(image_sigma) else 0.0
-    splines, _ = smoothing_splines(problem, solved.state, replace(integration, bending=bending))
+    splines, _ = smoothing_splines(problem, solved.state, replace(integration, bending=bending), solved.weight)
     known = problem.constrained() & problem.visible
     deviation = np.zeros(problem.visible.shape)
     pairs = _pairs(problem.visible)

@@ -60,6 +60,19 @@ def first_order_covariances(
     return np.asarray(covariance)
 
 
+def certainty(problem: Problem, state: State, active: tuple[str, ...], noise: PairNoise) -> np.ndarray:
+    """(P, F) reciprocal variance of the first-order terms of every point, in units of the median; 0 where it has none.
+
+    Rows must be whitened by their own sigmas. Slopes and curvatures are of order one, which is their prior: a point
+    with few pairs may not determine all of them.
+    """
+    covariance = first_order_covariances(problem, state, active, noise, prior=1.0)
+    known = np.isfinite(covariance).all(axis=(-2, -1))
+    reciprocal = np.zeros(known.shape)
+    reciprocal[known] = 1.0 / np.trace(covariance[known], axis1=1, axis2=2)
+    return reciprocal / np.median(reciprocal[known])
+
+
 @njit(cache=True, parallel=True)
 def _marginals(
     model, frame, log_scale, data, weight, edges, structure, columns, scaled, kappa, precision, huber, prior

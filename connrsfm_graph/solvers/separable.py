@@ -25,6 +25,7 @@ from connrsfm_graph.initialise import with_pair_scale
 from connrsfm_graph.integrate import Integrated, IntegrationConfig, balance_scales, integrate
 from connrsfm_graph.problem import Problem, State
 from connrsfm_graph.solvers.interface import Backend, Levenberg, Minimum
+from connrsfm_graph.solvers.marginals import certainty
 from connrsfm_graph.solvers.row_noise import RowNoise, estimate_row_noise
 from factors.noise import PairNoise
 
@@ -51,8 +52,8 @@ class SolveConfig:
     restarts: int = 2
     """Rounds in which points start again from the surface through all points; joint only."""
     sigmas: Literal["warps", "fixed"] = "fixed"
-    """Sigmas of the rows of every pair from the uncertainty of its warp and the misfit of the pre-step's surfaces, or
-    those of `noise` for all pairs."""
+    """Sigmas of the rows of every pair from the uncertainty of its warp and the misfit of the pre-step's surfaces
+    (terms are then integrated by how sure they are, too), or those of `noise` for all pairs."""
     noise: PairNoise = PairNoise(intrinsic=10.0, extrinsic=30.0)
     """Fixed sigmas of the metric, intrinsic and extrinsic rows (inf drops a block in either case), and the robust
     threshold."""
@@ -82,6 +83,8 @@ class Solved:
     """Convergence index after every outer iteration: change of the cost relative to the cost before."""
     row_noise: RowNoise | None = None
     """Noise of the rows of every pair as estimated; None where it was fixed."""
+    weight: np.ndarray | None = None
+    """(P, F) weight of each point's first-order terms in the last integration; None for 1."""
 
     def weighed(self, problem: Problem) -> Problem:
         """The problem that was solved, with the precisions of its rows."""
@@ -132,9 +135,12 @@ def _joint(
             if not improved:
                 break
         state = minimum.state
-    integrated = integrate(problem, state, integration)
+    weight = None  # rows that are all of one sigma do not tell how sure the terms are
+    if config.schedule == "joint" and problem.precision is not None:
+        weight = certainty(problem, state, active_variables(problem), config.noise)
+    integrated = integrate(problem, state, integration, weight)
     state = balance_scales(problem, _with_depth(problem, state, integrated, config.noise))
-    return Solved(state, integrated, costs, _indices(costs))
+    return Solved(state, integrated, costs, _indices(costs), weight=weight)
 
 
 def _restart_from_surface(

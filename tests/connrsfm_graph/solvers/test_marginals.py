@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from connrsfm_graph.solvers.gtsam_backend import marginal_covariances
-from connrsfm_graph.solvers.marginals import first_order_covariances
+from connrsfm_graph.solvers.marginals import certainty, first_order_covariances
 from factors.keys import key
-from factors.noise import PairNoise
+from factors.noise import ROWS, PairNoise
 from tests.connrsfm_graph.solvers.test_backends import random_problem
 
 
 @pytest.mark.parametrize("active", [("d",), ("d", "c"), ("d", "c", "s")])
 @pytest.mark.parametrize("noise", [PairNoise(0.5, 1.0, 2.0), PairNoise(0.5, 1.0, 2.0, huber=0.8)])
-def test_marginals_are_gtsams(active, noise):
+@pytest.mark.parametrize("precise", [False, True])
+def test_marginals_are_gtsams(active, noise, precise):
     problem, state = random_problem()
+    if precise:
+        precision = np.random.default_rng(1).uniform(0.3, 3.0, size=(*problem.weight.shape, ROWS))
+        problem = replace(problem, precision=precision)
     found = first_order_covariances(problem, state, active, noise)
     assert np.isnan(found[~problem.constrained()]).all()
     for point in range(problem.n_points):
@@ -33,3 +39,18 @@ def test_a_point_that_its_pairs_do_not_determine_takes_the_prior():
     variances = np.linalg.eigvalsh(found)
     assert (variances > 0).all()
     assert (variances <= 100.0 * (1 + 1e-9)).all()
+
+
+def test_terms_are_the_surer_the_more_precise_their_rows_are():
+    problem, state = random_problem()
+    precision = np.full((*problem.weight.shape, ROWS), 3.0)
+    before = certainty(replace(problem, precision=precision.copy()), state, ("d", "c"), PairNoise())
+    known = problem.constrained()
+    assert np.median(before[known]) == pytest.approx(1.0)
+    assert (before[~known] == 0).all()
+    precision[1] /= 10.0
+    after = certainty(replace(problem, precision=precision), state, ("d", "c"), PairNoise())
+    assert (after[1, known[1]] < 0.5 * before[1, known[1]]).all()
+    others = known.copy()
+    others[1] = False
+    assert np.ptp(after[others] / before[others]) < 1e-9

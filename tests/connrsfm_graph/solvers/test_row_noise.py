@@ -92,7 +92,7 @@ def test_the_solve_gains_on_fitted_warps(fitted):
     def error(sigmas):
         config = SolveConfig(sigmas=sigmas)
         solved = solve(problem, start, BACKEND, config, IntegrationConfig(), covariance=jets.covariance)
-        assert (solved.weighed(problem).precision is None) == (sigmas == "fixed")
+        assert (solved.weighed(problem).precision is None) == (solved.weight is None) == (sigmas == "fixed")
         return np.sqrt(((solved.state.first_order - truth) ** 2).mean())
 
     assert error("warps") < 0.9 * error("fixed")
