@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from experiments import accuracy, cloth, dense, slam, theorem
-from experiments.ablations import ABLATION, EDGES, ITERATIONS, STARTING_VALUES
+from experiments.ablations import ABLATION, EDGES, ITERATIONS, ROW_SIGMAS, STARTING_VALUES
 from experiments.missing import MISSING
 from experiments.publish import publish
 from experiments.real import FLAG, KINECT_PAPER, TSHIRT
@@ -30,6 +30,7 @@ TABLES: tuple[Experiment, ...] = (
     ITERATIONS,
     STARTING_VALUES,
     EDGES,
+    ROW_SIGMAS,
     TIME,
     PARALLEL,
     MISSING,

@@ -1,4 +1,4 @@
-"""Ablations, all from configuration: stages, rounds of the schedule, starting values and the number of image pairs."""
+"""Ablations, all from configuration: stages, rounds of the schedule, starting values, image pairs and sigmas."""
 
 from __future__ import annotations
 
@@ -9,26 +9,30 @@ from functools import partial
 
 from connrsfm_graph.reconstruct import Config, default_config
 from connrsfm_graph.tracks import Tracks, load_tracks
+from experiments.real import spoilt
 from experiments.study import Case, Experiment, Options
 from experiments.synthetic import data_set_1, tracks_of
 from factors.noise import PairNoise
 
 PAPER, DEFAULT = default_config("paper"), default_config()
+FIXED = replace(DEFAULT, solve=replace(DEFAULT.solve, sigmas="fixed"))
 LEVELS = {
     "pre-step alone": replace(PAPER, solve=replace(PAPER.solve, schedule="none")),
     "paper mode without pre-step": replace(PAPER, start="zeros"),
     "paper mode": PAPER,
-    "joint, all rows": replace(DEFAULT, solve=replace(DEFAULT.solve, noise=PairNoise()), refinement=False),
+    "joint, all rows": replace(FIXED, solve=replace(FIXED.solve, noise=PairNoise()), refinement=False),
     "joint, metric rows": replace(
-        DEFAULT, solve=replace(DEFAULT.solve, noise=PairNoise(1.0, math.inf, math.inf)), refinement=False
+        FIXED, solve=replace(FIXED.solve, noise=PairNoise(1.0, math.inf, math.inf)), refinement=False
     ),
     "joint, no second-order rows": replace(
-        DEFAULT, solve=replace(DEFAULT.solve, noise=replace(DEFAULT.solve.noise, extrinsic=math.inf)), refinement=False
+        FIXED, solve=replace(FIXED.solve, noise=replace(FIXED.solve.noise, extrinsic=math.inf)), refinement=False
     ),
+    "joint, fixed sigmas": replace(FIXED, refinement=False),
     "joint": replace(DEFAULT, refinement=False),
     "pre-step, refined": replace(DEFAULT, solve=replace(DEFAULT.solve, schedule="none")),
     "default, isometric model": replace(DEFAULT, refine=replace(DEFAULT.refine, model="isometric")),
     "default, conformal model": replace(DEFAULT, refine=replace(DEFAULT.refine, model="conformal")),
+    "default, fixed sigmas": FIXED,
     "default": DEFAULT,
 }
 """From the pre-step alone to everything."""
@@ -43,6 +47,40 @@ PAIRS = {
     for mode, config in (("paper mode", PAPER), ("default", DEFAULT))
     for extra in (0.0, 0.5, 1.0, 2.0, 4.0)
 }
+
+SIGMAS = {
+    "pre-step": replace(DEFAULT, solve=replace(DEFAULT.solve, schedule="none"), refinement=False),
+    "fixed": replace(FIXED, refinement=False),
+    "from the warps": replace(DEFAULT, solve=replace(DEFAULT.solve, sigmas="warps"), refinement=False),
+    "fixed, refined": FIXED,
+    "from the warps, refined": replace(DEFAULT, solve=replace(DEFAULT.solve, sigmas="warps")),
+}
+REAL = {
+    "T-shirt": ("tshirt.npz", 0, 0),
+    "T-shirt, 20 px": ("tshirt.npz", 20, 0),
+    "T-shirt, 50 px": ("tshirt.npz", 50, 0),
+    "T-shirt, 50 % missing": ("tshirt.npz", 0, 50),
+    "T-shirt, 70 % missing": ("tshirt.npz", 0, 70),
+    "KinectPaper": ("kinect_paper.npz", 0, 0),
+    "Flag": ("flag.npz", 0, 0),
+    "Flag, 4 px": ("flag.npz", 4, 0),
+}
+"""File, noise in pixels and percent missing."""
+
+
+def _sigmas(options: Options) -> Iterable[Case]:
+    """Every kind of sigmas on spheres and on the real data sets; the random ones with every seed."""
+    names = list(SIGMAS) if not options.quick else ["fixed", "from the warps"]
+    sets: list[tuple[str, int, partial[Tracks]]] = []
+    for seed in options.seeds():
+        sets.append(("spheres", seed, partial(tracks_of, data_set_1(options), seed)))
+    for data, (file, noise, missing) in ({} if options.quick else REAL).items():
+        path = options.data / file
+        for seed in (options.seeds() if noise or missing else [0]) if path.exists() else []:
+            sets.append((data, seed, partial(spoilt, path, noise, missing, seed)))
+    for data, seed, tracks in sets:
+        for name in names:
+            yield Case({"data": data, "sigmas": name, "seed": seed}, tracks, config=replace(SIGMAS[name], seed=seed))
 
 
 def _data_sets(options: Options) -> Iterable[tuple[str, int, partial[Tracks]]]:
@@ -74,6 +112,7 @@ ITERATIONS = Experiment(
 STARTING_VALUES = Experiment(
     "starting_values", "First-order terms at the start", partial(_by_mode, "start", STARTS), x="start"
 )
+ROW_SIGMAS = Experiment("sigmas", "Sigmas of the pair factors' rows", _sigmas)
 EDGES = Experiment(
     "edges",
     "Image pairs beside the spanning tree, per image",

@@ -21,7 +21,8 @@ FLAG_NOISE = 4
 """Pixels of the Flag's 640 x 480 images, as in the paper."""
 
 
-def _spoilt(path: Path, noise: float, missing: float, seed: int) -> Tracks:
+def spoilt(path: Path, noise: float, missing: float, seed: int) -> Tracks:
+    """Tracks of a file with noise in pixels and percent of the observations missing."""
     tracks = load_tracks(path)
     if noise:
         tracks = with_noise(tracks, noise, seed)
@@ -37,7 +38,7 @@ def _on(options: Options, file: str, conditions: dict[str, tuple[float, float]])
         for seed in options.seeds() if noise or missing else [0]:
             for name, (method, config) in VARIANTS.items():
                 keys = {"condition": condition, "method": name, "seed": seed}
-                yield Case(keys, partial(_spoilt, path, noise, missing, seed), method, config)
+                yield Case(keys, partial(spoilt, path, noise, missing, seed), method, config)
 
 
 def _tshirt(options: Options) -> Iterable[Case]:
