@@ -262,7 +262,7 @@ def make_guide(tracks: Tracks, joint: Joint, config: Config) -> Guide:
         surfaces=joint.surfaces,
         reference=joint.refined.reference,
         bending=joint.bending,
-        warps=joint.warps.config,
+        warps=replace(joint.warps.config, covariance=False),
         refine=config.refine,
         min_shared=config.graph.min_shared,
         camera=joint.problem.camera,
