@@ -33,6 +33,8 @@ _RESTARTS = 4
 """Rounds of restarts, at most."""
 _SUSPECT = (1.5, 0.02)
 """So may one of an isometric fit that costs so many times the lower quartile of the views, and so much per edge."""
+_PROMISING = 2.0
+"""Views of a second fit are restarted where it costs at most this many times the first."""
 _MISFIT = 1.0
 """Isometry is in doubt where its squared residuals exceed this many assumed variances on average."""
 _DOUBT = 0.15
@@ -135,11 +137,6 @@ def fit(task: Task, sigma_image: float) -> Fit:
         return fit_conformal(task, noise)
     isometric = fit_isometric(task, noise)
     misfit = _misfit(isometric)
-    if misfit > _MISFIT:
-        # The start may be to blame for all views alike; flat ones are neutral.
-        flat = replace(task.completed, log_depth=np.zeros_like(task.completed.log_depth))
-        again = fit_isometric(Task.of(flat, task.seen, task.config), noise)
-        isometric, misfit = min((isometric, misfit), (again, _misfit(again)), key=lambda found: found[1])
     isometric.evidence["isometric misfit"] = misfit
     if wanted == "isometric" or misfit <= _MISFIT:
         return isometric
@@ -158,11 +155,24 @@ def _misfit(found: Fit) -> float:
 
 
 def fit_isometric(task: Task, noise: Noise) -> Fit:
-    """Isometric fit from the start; views that cost more than others try other starts until none gains."""
+    """Isometric fit from the start and, where that leaves a doubt, from flat views; the cheaper one stays."""
+    found = _from_start(task, noise)
+    if _misfit(found) > _MISFIT or not _looks_like_noise(task, found):
+        # The surface may stretch, or the start may be to blame for all views alike; flat ones are neutral.
+        flat = replace(task, completed=replace(task.completed, log_depth=np.zeros_like(task.completed.log_depth)))
+        again = _from_start(flat, noise, _PROMISING * found.first_cost)
+        if again.first_cost < found.first_cost:
+            task, found = flat, again
+    return _settled(task, found)
+
+
+def _from_start(task: Task, noise: Noise, worth: float = np.inf) -> Fit:
+    """Isometric fit; where it costs less than `worth`, views that cost more than others try other starts until none
+    gains."""
     measurements = task.measurements(noise, conformal=False)
     shape, history = _minimise(task, measurements, start_shape(task.completed, task.mesh))
     factor, per_edge = _SUSPECT
-    for _ in range(_RESTARTS):
+    for _ in range(_RESTARTS if history[-1] < worth else 0):
         cost = costs(measurements, shape, lag(measurements, shape))
         suspect = np.flatnonzero(cost > max(factor * np.quantile(cost, 0.25), per_edge * len(task.mesh.edges)))
         if len(suspect) == 0:
@@ -172,7 +182,7 @@ def fit_isometric(task: Task, noise: Noise) -> Fit:
             break
         shape, more = _minimise(task, measurements, shape.replaced(suspect, better))
         history += more
-    return _settled(task, Fit(measurements, shape, noise, history, history[-1]))
+    return Fit(measurements, shape, noise, history, history[-1])
 
 
 def fit_conformal(task: Task, noise: Noise) -> Fit:
@@ -225,7 +235,8 @@ def _settled(task: Task, found: Fit) -> Fit:
     """The fit with the noise levels that the data show.
 
     Where the ray corrections look like noise, the image noise stands and the lengths are trusted more, as long as that
-    remains so. Where they do not, the image noise was assumed too large.
+    remains so. Where they do not, the image noise was assumed too large, as long as that leaves the shared lengths where
+    they are: what little noise is left would else crumple all views alike.
     """
     noisy = _looks_like_noise(task, found)
     if noisy:
@@ -241,7 +252,12 @@ def _settled(task: Task, found: Fit) -> Fit:
             noise = noise.lowered_image(found.shape.correction[task.seen])
         if noise.settled(found.noise):
             break
-        found = _refitted(task, found, noise)
+        again = _refitted(task, found, noise)
+        freed = noise.release > found.noise.release and not task.seen.all()  # which moves lengths for a good reason
+        moved = float(np.median(np.abs(again.shape.log_length - found.shape.log_length)))
+        if noise.image < found.noise.image and moved > noise.length and not freed:
+            break
+        found = again
     found.evidence.update(_noise_evidence(task, found))
     return replace(found, noisy=noisy)
 
