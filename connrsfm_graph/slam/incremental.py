@@ -4,8 +4,9 @@ The cost is that of `assemble`. With each view the last `lag` views, their map p
 are minimised over, given the estimates of all before (`window`); whenever the sequence has grown by a certain part, all
 cameras are relaxed with the shapes given (`relaxation`), which takes time in proportion to the views, but ever more
 rarely. The work per view is bounded on average, whatever the length of the sequence. What remains above the minimum is
-in the shapes: with the default lag less than 0.1 % of the cost (`experiments.benchmarks.growth` measures it). `finish`
-lets go of everything and ends in the minimum of the batch fusion; of sequences too long for that, `estimate` is final.
+in the shapes: with the default lag less than 0.1 % of the cost (`experiments.benchmarks.growth` measures it; with rigid
+landmarks right after `relax`). `finish` lets go of everything and ends in the minimum of the batch fusion; of sequences
+too long for that, `estimate` is final.
 
 Nothing is stored before a view has been minimised over: whatever is wrong with it, the estimate is as it was before.
 """

@@ -213,4 +213,5 @@ def fuse_live(
                 live.hold(*odometry, _sighted(background, view))
         if progress is not None:
             progress(view + 1, F)
+    live.fusion.relax()
     return live

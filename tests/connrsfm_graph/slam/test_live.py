@@ -97,8 +97,9 @@ def test_a_rigid_background_holds_the_camera(before_background, image):
     assert errors[1].rpe_rotation_deg < 0.6 * errors[0].rpe_rotation_deg
     seen_thrice = (scene.background_visible.sum(axis=0) >= 3).sum()
     assert live.fusion.values.size() == 2 * F + seen_thrice
-    landmarks = live.fusion.finish().others
-    assert landmarks.size() == seen_thrice
+    online, fused = live.fusion.cost(), live.fusion.finish()
+    assert fused.others.size() == seen_thrice
+    assert online < 1.001 * fused.cost
 
 
 def test_a_background_that_cannot_be_used_changes_nothing(before_background, image):
