@@ -25,6 +25,8 @@ _REWEIGHTINGS = 6
 _CUT = 5.0
 """Disagreement of a wrong track, in units of the neighbours' median error; of 20,000 right ones two exceed it."""
 _ROUNDS = 4
+_AGREEING = 0.25
+"""A track whose observations disagree with most other views everywhere keeps those that agree with so many."""
 
 
 def wrong_tracks(
@@ -41,15 +43,28 @@ def wrong_tracks(
     image = np.where(visible[..., None], image, 0.0)
     wrong = np.zeros_like(visible)
     for _ in range(_ROUNDS):
-        trusted = visible & ~wrong
+        trusted = visible & ~(wrong & ~_entirely(wrong, visible))
         last, wrong = wrong, visible & (disagreement(image, visible, trusted, others) > _CUT)
+        if others is None and _entirely(wrong, visible).any():
+            # Wrong in half of its views a track disagrees with most of them in all.
+            least = disagreement(image, visible, trusted, others, _AGREEING)
+            wrong &= (least > _CUT) | ~_entirely(wrong, visible)
         if (wrong == last).all():
             break
     return wrong
 
 
+def _entirely(wrong: np.ndarray, visible: np.ndarray) -> np.ndarray:
+    """(P,) bool, tracks with nothing right in any view."""
+    return np.asarray(visible.any(axis=0) & ~(visible & ~wrong).any(axis=0))
+
+
 def disagreement(
-    image: np.ndarray, visible: np.ndarray, trusted: np.ndarray, others: tuple[np.ndarray, np.ndarray] | None = None
+    image: np.ndarray,
+    visible: np.ndarray,
+    trusted: np.ndarray,
+    others: tuple[np.ndarray, np.ndarray] | None = None,
+    share: float = 0.5,
 ) -> np.ndarray:
     """(F, P) median over other views of the prediction error by its expected size; 0 where it cannot be judged.
 
@@ -58,6 +73,7 @@ def disagreement(
         visible: (F, P) bool, observations to judge.
         trusted: (F, P) bool, observations to judge by.
         others: as in `wrong_tracks`.
+        share: of the views that predict as well as this; 0.5 for the median.
     """
     sources, source_trusted = (image, trusted) if others is None else others
     F, P = visible.shape
@@ -74,7 +90,7 @@ def disagreement(
     for g in np.unique(chosen[chosen >= 0]):
         near[g] = _nearest(sources[g], source_trusted[g], near.shape[2])
     score = np.zeros((F, P))
-    over_views(_judge, F, image, visible, trusted, sources, source_trusted, chosen, near, score)
+    over_views(_judge, F, image, visible, trusted, sources, source_trusted, chosen, near, share, score)
     return score
 
 
@@ -91,7 +107,7 @@ def _nearest(points: np.ndarray, trusted: np.ndarray, count: int) -> np.ndarray:
 
 
 @njit(cache=True, nogil=True)
-def _judge(first, last, image, visible, trusted, sources, source_trusted, chosen, near, score):
+def _judge(first, last, image, visible, trusted, sources, source_trusted, chosen, near, share, score):
     """Disagreement of views first to last - 1 into `score` (F, P)."""
     P = visible.shape[1]
     ratios = np.empty(chosen.shape[1])
@@ -113,7 +129,7 @@ def _judge(first, last, image, visible, trusted, sources, source_trusted, chosen
                     ratios[known] = _prediction_error(sources[g], image[f], i, neighbours[:count])
                     known += 1
             if known > 0:
-                score[f, i] = np.median(ratios[:known])
+                score[f, i] = np.quantile(ratios[:known], share)
 
 
 @njit(cache=True, nogil=True)

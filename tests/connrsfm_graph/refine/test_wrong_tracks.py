@@ -32,3 +32,13 @@ def test_unseen_points_are_not_judged():
 def test_too_few_points_to_judge_by_judge_nothing():
     rng = np.random.default_rng(0)
     assert not wrong_tracks(rng.uniform(size=(4, 5, 2)), np.ones((4, 5), dtype=bool)).any()
+
+
+@pytest.mark.parametrize("point", range(0, 60, 12))
+def test_a_track_wrong_in_half_of_its_views_is_right_in_the_others(point):
+    """It disagrees with most views in all of them; forgiving it there leaves its wrong half in the reconstruction."""
+    tracks = isometric_bending(n_frames=6, n_points=60).tracks
+    image, wrong = tracks.normalised(), np.zeros_like(tracks.visible)
+    wrong[:3, point] = True
+    image[wrong] += 0.1 * np.array([[1.0, 0.3], [-0.5, 0.8], [0.2, -1.0]])
+    np.testing.assert_array_equal(wrong_tracks(image, tracks.visible), wrong)
