@@ -13,6 +13,9 @@ import numba
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
+_RANGES = 4
+"""Of views, for every thread."""
+
 
 @cache
 def _pool(threads: int) -> ThreadPoolExecutor:
@@ -20,19 +23,24 @@ def _pool(threads: int) -> ThreadPoolExecutor:
 
 
 def over_views(kernel: Callable[..., None], n_views: int, *arguments: Any) -> None:
-    """Call kernel(first, last, *arguments) on ranges that cover all views, one range per thread.
+    """Call kernel(first, last, *arguments) on ranges that cover all views, a few for every thread.
 
     The kernel writes into its arguments, each view's part separately, so the result does not depend on the number of
-    threads, which is numba's (`NUMBA_NUM_THREADS`).
+    threads, which is numba's (`NUMBA_NUM_THREADS`). Threads that are done early take over ranges of the others.
     """
     threads = max(1, min(n_views, numba.get_num_threads()))
     if threads == 1:
         kernel(0, n_views, *arguments)
         return
-    bounds = [n_views * n // threads for n in range(threads + 1)]
-    own, *others = pairwise(bounds)
-    tasks = [_pool(threads).submit(kernel, a, b, *arguments) for a, b in others]
-    kernel(*own, *arguments)
+    count = min(n_views, _RANGES * threads)
+    ranges = iter(list(pairwise(n_views * n // count for n in range(count + 1))))
+
+    def work() -> None:
+        for first, last in ranges:  # each is handed out once: the interpreter's lock is held meanwhile
+            kernel(first, last, *arguments)
+
+    tasks = [_pool(threads).submit(work) for _ in range(threads - 1)]
+    work()
     for task in tasks:
         task.result()
 

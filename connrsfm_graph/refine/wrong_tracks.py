@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from scipy.spatial import cKDTree
 
-from connrsfm_graph.threads import over_views
+from connrsfm_graph.threads import mapped, over_views
 
 _NEIGHBOURS = 12
 """Points from which a position is predicted, at most; at least half as many."""
@@ -87,8 +87,11 @@ def disagreement(
         best = order[np.unique(np.linspace(0, len(order) - 1, min(len(order), _SOURCES)).astype(int))]
         chosen[f, : len(best)] = best
     near = np.full((len(sources), P, min(_AT_HAND, P)), -1)
-    for g in np.unique(chosen[chosen >= 0]):
-        near[g] = _nearest(sources[g], source_trusted[g], near.shape[2])
+    needed = np.unique(chosen[chosen >= 0])
+    for g, found in zip(
+        needed, mapped(lambda g: _nearest(sources[g], source_trusted[g], near.shape[2]), needed), strict=True
+    ):
+        near[g] = found
     score = np.zeros((F, P))
     over_views(_judge, F, image, visible, trusted, sources, source_trusted, chosen, near, share, score)
     return score
