@@ -52,8 +52,6 @@ SIGMAS = {
     "pre-step": replace(DEFAULT, solve=replace(DEFAULT.solve, schedule="none"), refinement=False),
     "fixed": replace(FIXED, refinement=False),
     "from the warps": replace(DEFAULT, solve=replace(DEFAULT.solve, sigmas="warps"), refinement=False),
-    "fixed, refined": FIXED,
-    "from the warps, refined": replace(DEFAULT, solve=replace(DEFAULT.solve, sigmas="warps")),
 }
 REAL = {
     "T-shirt": ("tshirt.npz", 0, 0),
@@ -112,7 +110,7 @@ ITERATIONS = Experiment(
 STARTING_VALUES = Experiment(
     "starting_values", "First-order terms at the start", partial(_by_mode, "start", STARTS), x="start"
 )
-ROW_SIGMAS = Experiment("sigmas", "Sigmas of the pair factors' rows", _sigmas)
+ROW_SIGMAS = Experiment("sigmas", "Sigmas of the pair factors' rows, before the refinement", _sigmas)
 EDGES = Experiment(
     "edges",
     "Image pairs beside the spanning tree, per image",
