@@ -69,6 +69,9 @@ def account_of(
         "convergence index": solved.index_history,
         "scale convention": "each image is scaled so that the median conformal scale of the edges is 1",
     }
+    if solved.row_noise is not None:
+        decisions["sigmas of the pair factors' rows"] = dict(solved.row_noise.sigma)
+        decisions["share of the warps in their squares"] = dict(solved.row_noise.share)
     costs = {"differential solve": list(solved.cost_history)}
     if refined is not None:
         decisions |= {"model": refined.model, "refinement": dict(refined.evidence)}

@@ -15,25 +15,25 @@ from experiments.synthetic import data_set_1, tracks_of
 from factors.noise import PairNoise
 
 PAPER, DEFAULT = default_config("paper"), default_config()
-FIXED = replace(DEFAULT, solve=replace(DEFAULT.solve, sigmas="fixed"))
+FROM_WARPS = replace(DEFAULT, solve=replace(DEFAULT.solve, sigmas="warps"))
 LEVELS = {
     "pre-step alone": replace(PAPER, solve=replace(PAPER.solve, schedule="none")),
     "paper mode without pre-step": replace(PAPER, start="zeros"),
     "paper mode": PAPER,
-    "joint, all rows": replace(FIXED, solve=replace(FIXED.solve, noise=PairNoise()), refinement=False),
+    "joint, all rows": replace(DEFAULT, solve=replace(DEFAULT.solve, noise=PairNoise()), refinement=False),
     "joint, metric rows": replace(
-        FIXED, solve=replace(FIXED.solve, noise=PairNoise(1.0, math.inf, math.inf)), refinement=False
+        DEFAULT, solve=replace(DEFAULT.solve, noise=PairNoise(1.0, math.inf, math.inf)), refinement=False
     ),
     "joint, no second-order rows": replace(
-        FIXED, solve=replace(FIXED.solve, noise=replace(FIXED.solve.noise, extrinsic=math.inf)), refinement=False
+        DEFAULT, solve=replace(DEFAULT.solve, noise=replace(DEFAULT.solve.noise, extrinsic=math.inf)), refinement=False
     ),
-    "joint, fixed sigmas": replace(FIXED, refinement=False),
     "joint": replace(DEFAULT, refinement=False),
+    "joint, sigmas from the warps": replace(FROM_WARPS, refinement=False),
     "pre-step, refined": replace(DEFAULT, solve=replace(DEFAULT.solve, schedule="none")),
     "default, isometric model": replace(DEFAULT, refine=replace(DEFAULT.refine, model="isometric")),
     "default, conformal model": replace(DEFAULT, refine=replace(DEFAULT.refine, model="conformal")),
-    "default, fixed sigmas": FIXED,
     "default": DEFAULT,
+    "default, sigmas from the warps": FROM_WARPS,
 }
 """From the pre-step alone to everything."""
 ROUNDS = {str(n): replace(PAPER, solve=replace(PAPER.solve, outer_iterations=n)) for n in range(1, 6)}
@@ -50,8 +50,8 @@ PAIRS = {
 
 SIGMAS = {
     "pre-step": replace(DEFAULT, solve=replace(DEFAULT.solve, schedule="none"), refinement=False),
-    "fixed": replace(FIXED, refinement=False),
-    "from the warps": replace(DEFAULT, solve=replace(DEFAULT.solve, sigmas="warps"), refinement=False),
+    "fixed": replace(DEFAULT, refinement=False),
+    "from the warps": replace(FROM_WARPS, refinement=False),
 }
 REAL = {
     "T-shirt": ("tshirt.npz", 0, 0),

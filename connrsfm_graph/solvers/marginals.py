@@ -20,7 +20,7 @@ from connrsfm_graph.solvers.batched import (
     solve_point,
 )
 from connrsfm_graph.solvers.block_cholesky import analyse
-from connrsfm_graph.solvers.interface import PairModel
+from connrsfm_graph.solvers.interface import Minimum, PairModel
 from factors.noise import PairNoise
 
 
@@ -60,16 +60,22 @@ def first_order_covariances(
     return np.asarray(covariance)
 
 
-def certainty(problem: Problem, state: State, active: tuple[str, ...], noise: PairNoise) -> np.ndarray:
+def certainty(problem: Problem, minimum: Minimum, active: tuple[str, ...], noise: PairNoise) -> np.ndarray:
     """(P, F) reciprocal variance of the first-order terms of every point, in units of the median; 0 where it has none.
 
-    Rows must be whitened by their own sigmas. Slopes and curvatures are of order one, which is their prior: a point
-    with few pairs may not determine all of them.
+    A point's marginal variance is multiplied by what its rows leave per degree of freedom, half its own and half that
+    of a typical point: a point in a wrong minimum is sharply determined, too, but contradicts its rows. Slopes and
+    curvatures are of order one, which is their prior, since a point with few pairs may not determine all of them.
     """
-    covariance = first_order_covariances(problem, state, active, noise, prior=1.0)
+    covariance = first_order_covariances(problem, minimum.state, active, noise, prior=1.0)
     known = np.isfinite(covariance).all(axis=(-2, -1))
+    rows = int((noise.precisions() > 0).sum()) - ("s" in active)
+    columns = 2 * ("d" in active) + 3 * ("c" in active)
+    freedom = rows * (problem.weight > 0).sum(axis=1) - columns * known.sum(axis=1)
+    misfit = minimum.cost / np.maximum(freedom, 1)
+    misfit += max(float(np.median(misfit[known.any(axis=1)])), np.finfo(float).tiny)
     reciprocal = np.zeros(known.shape)
-    reciprocal[known] = 1.0 / np.trace(covariance[known], axis1=1, axis2=2)
+    reciprocal[known] = 1.0 / (np.trace(covariance, axis1=2, axis2=3) * misfit[:, None])[known]
     return reciprocal / np.median(reciprocal[known])
 
 

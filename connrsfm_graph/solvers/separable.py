@@ -51,9 +51,10 @@ class SolveConfig:
     """N_t, rounds of steps 1 to 4; separable only."""
     restarts: int = 2
     """Rounds in which points start again from the surface through all points; joint only."""
-    sigmas: Literal["warps", "fixed"] = "fixed"
-    """Sigmas of the rows of every pair from the uncertainty of its warp and the misfit of the pre-step's surfaces
-    (terms are then integrated by how sure they are, too), or those of `noise` for all pairs."""
+    sigmas: Literal["fixed", "warps"] = "fixed"
+    """Sigmas of the rows: those of `noise` for all pairs, or those of every pair from the uncertainty of its warp and
+    the misfit of the pre-step's surfaces; then terms are integrated by how sure they are, too. Surfaces that are not
+    refined are nearly always better for it, refined ones of noisy tracks can be slightly worse."""
     noise: PairNoise = PairNoise(intrinsic=10.0, extrinsic=30.0)
     """Fixed sigmas of the metric, intrinsic and extrinsic rows (inf drops a block in either case), and the robust
     threshold."""
@@ -124,7 +125,7 @@ def _joint(
     progress: Callable[[int, int], None] | None,
 ) -> Solved:
     """All variables of a point together; the start itself where the schedule is `none`."""
-    state, costs = start, []
+    state, costs, weight = start, [], None
     if config.schedule == "joint":
         costs.append(total_cost(problem, state, backend, config.noise))
         minimum = backend.minimise(problem, state, active_variables(problem), config.noise, settings=config.levenberg)
@@ -134,10 +135,7 @@ def _joint(
             costs.append(float(minimum.cost.sum()))
             if not improved:
                 break
-        state = minimum.state
-    weight = None  # rows that are all of one sigma do not tell how sure the terms are
-    if config.schedule == "joint" and problem.precision is not None:
-        weight = certainty(problem, state, active_variables(problem), config.noise)
+        state, weight = minimum.state, _weight(problem, minimum, config.noise)
     integrated = integrate(problem, state, integration, weight)
     state = balance_scales(problem, _with_depth(problem, state, integrated, config.noise))
     return Solved(state, integrated, costs, _indices(costs), weight=weight)
@@ -150,7 +148,7 @@ def _restart_from_surface(
 
     A point's cost has several minima (a patch seen concave or convex); its neighbours know which is right.
     """
-    surface = integrate(problem, minimum.state)
+    surface = integrate(problem, minimum.state, weight=_weight(problem, minimum, config.noise))
     misfit = np.linalg.norm(minimum.state.first_order - surface.first_order, axis=-1) * problem.constrained()
     again = np.flatnonzero(misfit.max(axis=1) > OFF_SURFACE * np.median(misfit[misfit > 0]))
     start = minimum.state.updated(first_order=surface.first_order, second_order=surface.second_order)
@@ -165,6 +163,11 @@ def _restart_from_surface(
     kept.cost[chosen] = trial.cost[better]
     kept.iterations[again] += trial.iterations
     return kept, bool(better.any())
+
+
+def _weight(problem: Problem, minimum: Minimum, noise: PairNoise) -> np.ndarray | None:
+    """(P, F) weight of first-order terms: how sure they are, which rows that are all of one sigma do not tell."""
+    return None if problem.precision is None else certainty(problem, minimum, active_variables(problem), noise)
 
 
 def total_cost(problem: Problem, state: State, backend: Backend, noise: PairNoise) -> float:

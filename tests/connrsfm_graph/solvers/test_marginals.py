@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from connrsfm_graph.solvers.gtsam_backend import marginal_covariances
+from connrsfm_graph.solvers.interface import Minimum
 from connrsfm_graph.solvers.marginals import certainty, first_order_covariances
 from factors.keys import key
 from factors.noise import ROWS, PairNoise
@@ -41,16 +42,21 @@ def test_a_point_that_its_pairs_do_not_determine_takes_the_prior():
     assert (variances <= 100.0 * (1 + 1e-9)).all()
 
 
-def test_terms_are_the_surer_the_more_precise_their_rows_are():
+def test_terms_are_the_surer_the_more_precise_their_rows_are_and_the_less_these_leave():
     problem, state = random_problem()
-    precision = np.full((*problem.weight.shape, ROWS), 3.0)
-    before = certainty(replace(problem, precision=precision.copy()), state, ("d", "c"), PairNoise())
     known = problem.constrained()
-    assert np.median(before[known]) == pytest.approx(1.0)
-    assert (before[~known] == 0).all()
-    precision[1] /= 10.0
-    after = certainty(replace(problem, precision=precision), state, ("d", "c"), PairNoise())
-    assert (after[1, known[1]] < 0.5 * before[1, known[1]]).all()
     others = known.copy()
     others[1] = False
-    assert np.ptp(after[others] / before[others]) < 1e-9
+
+    def found(of_point, cost):
+        precision = np.full((*problem.weight.shape, ROWS), 3.0)
+        precision[1] *= of_point
+        at = Minimum(state, np.array([1.0, cost, 1.0, 1.0, 1.0, 1.0]), np.zeros(6, dtype=int))
+        return certainty(replace(problem, precision=precision), at, ("d", "c"), PairNoise())
+
+    before = found(1.0, 1.0)
+    assert np.median(before[known]) == pytest.approx(1.0)
+    assert (before[~known] == 0).all()
+    for worse in (found(0.1, 1.0), found(1.0, 100.0)):
+        assert (worse[1, known[1]] < 0.5 * before[1, known[1]]).all()
+        assert np.ptp(worse[others] / before[others]) < 0.1
