@@ -235,8 +235,8 @@ def _settled(task: Task, found: Fit) -> Fit:
     """The fit with the noise levels that the data show.
 
     Where the ray corrections look like noise, the image noise stands and the lengths are trusted more, as long as that
-    remains so. Where they do not, the image noise was assumed too large, as long as that leaves the shared lengths where
-    they are: what little noise is left would else crumple all views alike.
+    remains so. Where they do not, the image noise was assumed too large, as long as that leaves the shared lengths
+    where they are: what little noise is left would else crumple all views alike.
     """
     noisy = _looks_like_noise(task, found)
     if noisy:
