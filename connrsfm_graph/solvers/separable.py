@@ -54,7 +54,7 @@ class SolveConfig:
     sigmas: Literal["fixed", "warps"] = "fixed"
     """Sigmas of the rows: those of `noise` for all pairs, or those of every pair from the uncertainty of its warp and
     the misfit of the pre-step's surfaces; then terms are integrated by how sure they are, too. Surfaces that are not
-    refined are better for it or as good (`python -m experiments sigmas`), refined ones of noisy tracks slightly worse."""
+    refined are better for it or as good (see `experiments sigmas`), refined ones of noisy tracks slightly worse."""
     noise: PairNoise = PairNoise(intrinsic=10.0, extrinsic=30.0)
     """Fixed sigmas of the metric, intrinsic and extrinsic rows (inf drops a block in either case), and the robust
     threshold."""
