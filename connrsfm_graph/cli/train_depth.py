@@ -12,6 +12,7 @@ _SETTINGS = (
     ("batch", int, "surfaces per batch"),
     ("size", int, "pixels per side of the images, a multiple of 32"),
     ("noise", float, "largest noise on the normals, 0 for none"),
+    ("rate", float, "largest step size of the optimiser"),
     ("held_out", int, "surfaces that it is evaluated on"),
     ("seed", int, "seed of weights and surfaces"),
 )

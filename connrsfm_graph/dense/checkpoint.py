@@ -78,8 +78,8 @@ class Checkpoint:
 def card_text(checkpoint: Checkpoint) -> str:
     """The card of a checkpoint as Markdown: the command that makes it again, and its errors while it was trained."""
     settings, history = checkpoint.card["configuration"], checkpoint.card["history"]
-    named = ("variant", "steps", "batch", "size", "noise", "seed")
-    options = " ".join(f"--{name} {settings[name]}" for name in named)
+    named = ("variant", "steps", "batch", "size", "noise", "rate", "seed")
+    options = " ".join(f"--{name} {settings[name]}" for name in named if settings[name] is not None)
     parameters = sum(parameter.numel() for parameter in checkpoint.network.parameters())
     lines = [
         f"# Depth network `{checkpoint.variant}`, {parameters:,} parameters",

@@ -24,6 +24,8 @@ from connrsfm_graph.files import written_beside
 
 HELD_OUT_NOISE = 0.2
 """Noise on the normals of the noisy half of the held-out surfaces."""
+_RATE, _RATE_DEEP = 2e-3, 3e-4
+"""Step sizes of the compact network, and of the deep ones, which diverge with more."""
 _TRAINING, _HELD_OUT = 0, 1
 
 
@@ -41,8 +43,8 @@ class TrainConfig:
     """Pixels per side of the images, a multiple of 32."""
     noise: float = 0.25
     """Largest standard deviation of the noise on the components of unit normals; 0 trains without augmentation."""
-    rate: float = 2e-3
-    """Adam's step size; it grows over the first steps and falls to 0 over the last `decay` of them."""
+    rate: float | None = None
+    """Adam's largest step size, None the variant's; it rises first, and falls to 0 over the last `decay` of them."""
     decay: float = 0.4
     """Part of the steps over which the step size falls."""
     seed: int = 0
@@ -58,8 +60,13 @@ class TrainConfig:
         for name in ("steps", "batch", "every", "held_out"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} is {getattr(self, name)}, expected at least 1")
-        if not 0.0 <= self.noise <= 1.0 or not self.rate > 0.0 or not 0.0 < self.decay <= 1.0 or self.seed < 0:
+        if not 0.0 <= self.noise <= 1.0 or not self.step_size > 0.0 or not 0.0 < self.decay <= 1.0 or self.seed < 0:
             raise InputError("noise and decay must be from 0 to 1, rate above 0 and seed not negative")
+
+    @property
+    def step_size(self) -> float:
+        """Adam's largest step size."""
+        return self.rate if self.rate is not None else _RATE if self.variant == "compact" else _RATE_DEEP
 
 
 def train(
@@ -87,7 +94,7 @@ def train(
     out = Path(out)
     state_file = out.with_name(out.name + ".state")
     network = make_network(config.variant, config.seed).to(device)
-    optimiser = torch.optim.Adam(network.parameters(), lr=config.rate)
+    optimiser = torch.optim.Adam(network.parameters(), lr=config.step_size)
     step, history = 0, []
     if state_file.exists():
         state = read_tensors(state_file)
@@ -98,7 +105,7 @@ def train(
         step, history = state["step"], state["history"]
     while step < config.steps:
         for group in optimiser.param_groups:
-            group["lr"] = config.rate * _schedule(step, config)
+            group["lr"] = config.step_size * _schedule(step, config)
         batch = simulate(config.batch, config.size, (_TRAINING, config.seed, step), (0.0, config.noise))
         loss = _step(network, optimiser, batch, device)
         step += 1

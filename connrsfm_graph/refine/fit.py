@@ -10,6 +10,7 @@ import numpy as np
 from connrsfm_graph.refine.ambiguity import Ambiguity, resolve
 from connrsfm_graph.refine.config import RefineConfig
 from connrsfm_graph.refine.cost import Weights
+from connrsfm_graph.refine.held_out import prediction_errors, predicts_better
 from connrsfm_graph.refine.mesh import Mesh
 from connrsfm_graph.refine.noise import Noise, neighbour_correlation
 from connrsfm_graph.refine.restarts import inverted, restart
@@ -235,17 +236,12 @@ def _settled(task: Task, found: Fit) -> Fit:
     """The fit with the noise levels that the data show.
 
     Where the ray corrections look like noise, the image noise stands and the lengths are trusted more, as long as that
-    remains so. Where they do not, the image noise was assumed too large, as long as that leaves the shared lengths
-    where they are: what little noise is left would else crumple all views alike.
+    predicts image points better. Where they do not, the image noise was assumed too large, as long as that leaves the
+    shared lengths where they are: what little noise is left would else crumple all views alike.
     """
     noisy = _looks_like_noise(task, found)
     if noisy:
-        best = found
-        for _ in range(_HALVINGS):
-            found = _refitted(task, found, found.noise.after_fit(found.residuals()).halved_length())
-            if _looks_like_noise(task, found):
-                best = found
-        found = best
+        found = _trusting_lengths(task, found)
     for _ in range(_ROUNDS):
         noise = found.noise.after_fit(found.residuals())
         if not noisy:
@@ -260,6 +256,18 @@ def _settled(task: Task, found: Fit) -> Fit:
         found = again
     found.evidence.update(_noise_evidence(task, found))
     return replace(found, noisy=noisy)
+
+
+def _trusting_lengths(task: Task, found: Fit) -> Fit:
+    """The fit with half the length noise, or a quarter, as long as points left out are predicted better."""
+    errors = prediction_errors(found.measurements, found.shape, task.seen)
+    for _ in range(_HALVINGS):
+        trial = _refitted(task, found, found.noise.halved_length())
+        new = prediction_errors(trial.measurements, trial.shape, task.seen)
+        if not predicts_better(new, errors):
+            break
+        found, errors = trial, new
+    return found
 
 
 def _looks_like_noise(task: Task, found: Fit) -> bool:

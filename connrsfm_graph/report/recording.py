@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -67,7 +68,9 @@ def write_recording(
         for f in surfaces.frames:
             recording.set_time(TIMELINE, sequence=f)
             mesh = shown_mesh(reconstruction, surfaces, dense, f, _VERTICES)
-            look = {"vertex_colors": ramp_colours(depth.ramp, mesh.values[depth.name], depth.lower, depth.upper)}
+            look: dict[str, Any] = {
+                "vertex_colors": ramp_colours(depth.ramp, mesh.values[depth.name], depth.lower, depth.upper)
+            }
             if photos is not None:
                 image = photos[f].image
                 places = (photos[f].place(mesh.pixels) + 0.5) / image.shape[1::-1]

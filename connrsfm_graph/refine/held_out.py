@@ -1,0 +1,52 @@
+"""How well a fit predicts image points that it was not given.
+
+With strong image noise the size of a fit's residuals does not say how far lengths are to be trusted: ray corrections
+take over what lengths may not explain. Points left out tell: lengths trusted too far pass the noise on to the
+neighbours' points, lengths trusted too little pass nothing on.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from connrsfm_graph.refine.solve import Measurements, Shape, minimise
+
+_PARTS, _USED = 5, 3
+"""Observations are dealt out at random to so many parts, of which so many are left out in turn."""
+_LEFT_OUT = 1e-2
+"""Factor on the weight of an image point that is left out: enough to keep it where nothing else holds it."""
+_ITERATIONS = 8
+"""Of every fit, the same number for all that are compared."""
+_SIGNIFICANT = 2.0
+"""Standard errors by which the errors' mean must differ."""
+_GROSS = 9.0
+"""Squared errors count up to this many times their median: wrong tracks predict nothing."""
+
+
+def prediction_errors(measurements: Measurements, shape: Shape, seen: np.ndarray) -> np.ndarray:
+    """(N,) squared distances of image points from where the fit to the others puts them.
+
+    Args:
+        measurements: what was fitted.
+        shape: the fit to all points.
+        seen: (F, P) bool; points are the same for the same array.
+    """
+    part = np.where(seen, np.random.default_rng(0).integers(_PARTS, size=seen.shape), _PARTS)
+    errors = []
+    for number in range(_USED):
+        left_out = part == number
+        weight = np.where(left_out, _LEFT_OUT, 1.0) * measurements.image_weight
+        fitted, _ = minimise(replace(measurements, image_weight=weight), shape, _ITERATIONS, 0.0)
+        errors.append((fitted.correction[left_out] ** 2).sum(axis=-1))
+    return np.concatenate(errors)
+
+
+def predicts_better(errors: np.ndarray, than: np.ndarray) -> bool:
+    """Whether squared errors (N,) of one fit are significantly smaller than those of another at the same points."""
+    if len(errors) < 2:
+        return False
+    most = _GROSS * float(np.median(than))
+    difference = np.minimum(errors, most) - np.minimum(than, most)
+    return bool(difference.mean() < -_SIGNIFICANT * difference.std() / np.sqrt(len(difference)))

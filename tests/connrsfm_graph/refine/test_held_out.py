@@ -1,0 +1,73 @@
+"""Prediction of image points that a fit was not given."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from connrsfm_graph.refine import RefineConfig
+from connrsfm_graph.refine.fit import Task
+from connrsfm_graph.refine.held_out import prediction_errors, predicts_better
+from connrsfm_graph.refine.noise import Noise
+from connrsfm_graph.refine.solve import Measurements, Shape, minimise
+from connrsfm_graph.refine.start import start_shape
+from connrsfm_graph.refine.unseen import complete
+from connrsfm_graph.synthetic import isometric_bending, with_noise
+
+PIXELS = 2.0
+
+
+def fitted(length_sigma: float) -> tuple[Measurements, Shape, np.ndarray, float]:
+    """A fit to noisy image points of an isometric scene, what is seen, and the standard deviation of the noise."""
+    scene = isometric_bending(n_frames=6, n_points=60, seed=1)
+    tracks = with_noise(scene.tracks, PIXELS, seed=1)
+    sigma = PIXELS / tracks.focal_length()
+    completed = complete(tracks.normalised(), tracks.visible, scene.log_depth)
+    task = Task.of(completed, tracks.visible, RefineConfig())
+    measurements = task.measurements(Noise.start(sigma, length_sigma, task.spacing()), conformal=False)
+    shape, _ = minimise(measurements, start_shape(task.completed, task.mesh), 30, 1e-4)
+    return measurements, shape, tracks.visible, sigma
+
+
+def test_points_left_out_are_predicted_to_about_their_noise() -> None:
+    measurements, shape, seen, sigma = fitted(0.01)
+    errors = prediction_errors(measurements, shape, seen)
+    assert 0.5 * seen.sum() < len(errors) < 0.7 * seen.sum()
+    assert 2 * sigma**2 < errors.mean() < 5 * sigma**2  # more than the fit's own corrections, of which it knows
+    assert (shape.correction**2).sum(axis=-1).mean() < 0.9 * errors.mean()
+    np.testing.assert_array_equal(errors, prediction_errors(measurements, shape, seen))
+
+
+def test_what_a_point_left_out_says_is_not_used() -> None:
+    """Image points moved together with the corrections of the start are the same surface, and predicted there."""
+    measurements, shape, seen, sigma = fitted(0.01)
+    before = prediction_errors(measurements, shape, seen)
+    # The first part left out is where the errors come first.
+    part = np.random.default_rng(0).integers(5, size=seen.shape)
+    frame, point = np.argwhere(part == 0)[0]
+    image = measurements.image.copy()
+    image[frame, point, 0] += 50 * sigma
+    after = prediction_errors(replace(measurements, image=image), shape, seen)
+    assert np.sqrt(after[0]) == pytest.approx(50 * sigma, abs=5 * sigma)
+    first = np.count_nonzero(part == 0)
+    np.testing.assert_allclose(after[1:first], before[1:first], atol=sigma**2)
+
+
+def test_lengths_that_hold_little_predict_worse() -> None:
+    errors = {length: prediction_errors(*fitted(length)[:3]) for length in (0.003, 0.1)}
+    assert predicts_better(errors[0.003], errors[0.1])
+    assert not predicts_better(errors[0.1], errors[0.003])
+
+
+def test_chance_is_not_better() -> None:
+    rng = np.random.default_rng(0)
+    errors = rng.chisquare(2, 500)
+    wild = errors.copy()
+    wild[::50] *= 1e6
+    assert not predicts_better(errors, errors)
+    assert not predicts_better(errors + rng.normal(0, 0.3, 500), errors)
+    assert predicts_better(0.9 * errors, errors)
+    assert not predicts_better(errors, wild * 0.9)  # gross errors do not decide
+    assert not predicts_better(errors[:1] - 1, errors[:1])
