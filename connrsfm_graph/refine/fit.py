@@ -38,6 +38,8 @@ _PROMISING = 2.0
 """Views of a second fit are restarted where it costs at most this many times the first."""
 _MISFIT = 1.0
 """Isometry is in doubt where its squared residuals exceed this many assumed variances on average."""
+_BEYOND_DOUBT = 0.05
+"""A fit that leaves less than this is right, whatever its ray corrections look like."""
 _DOUBT = 0.15
 """The same for the conformal model, which bends to many a wrong shape: its fit is then repeated from flat views."""
 _RATIO = 6.0
@@ -158,7 +160,8 @@ def _misfit(found: Fit) -> float:
 def fit_isometric(task: Task, noise: Noise) -> Fit:
     """Isometric fit from the start and, where that leaves a doubt, from flat views; the cheaper one stays."""
     found = _from_start(task, noise)
-    if _misfit(found) > _MISFIT or not _looks_like_noise(task, found):
+    misfit = _misfit(found)
+    if misfit > _MISFIT or (misfit > _BEYOND_DOUBT and not _looks_like_noise(task, found)):
         # The surface may stretch, or the start may be to blame for all views alike; flat ones are neutral.
         flat = replace(task, completed=replace(task.completed, log_depth=np.zeros_like(task.completed.log_depth)))
         again = _from_start(flat, noise, _PROMISING * found.first_cost)
@@ -260,6 +263,8 @@ def _settled(task: Task, found: Fit) -> Fit:
 
 def _trusting_lengths(task: Task, found: Fit) -> Fit:
     """The fit with half the length noise, or a quarter, as long as points left out are predicted better."""
+    if _misfit(found) < _BEYOND_DOUBT:
+        return found
     errors = prediction_errors(found.measurements, found.shape, task.seen)
     for _ in range(_HALVINGS):
         trial = _refitted(task, found, found.noise.halved_length())
