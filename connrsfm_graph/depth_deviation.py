@@ -67,7 +67,8 @@ def depth_deviation(
         values[seen] -= values[seen].mean(axis=0)
         control = spline.control_covariance(bending, covariance[known[:, j], j])
         deviation[:, j] = _standard(values, control)
-        shown = seen[pairs].all(axis=1)
+        apart = (problem.image[pairs[:, 0], j] != problem.image[pairs[:, 1], j]).any(axis=1)
+        shown = seen[pairs].all(axis=1) & apart  # a point tracked twice has no length to itself
         a, b = pairs[shown].T
         chord, by_a, by_b = _chords(problem, solved.state.log_depth[:, j], j, a, b)
         log_length[j, shown] = 0.5 * np.log((chord**2).sum(axis=1))

@@ -71,3 +71,13 @@ def test_noisier_tracks_are_less_sure():
     scene, config = isometric_bending(8, 40, seed=2), replace(default_config(), refinement=False)
     quiet, noisy = (reconstruct(with_noise(scene.tracks, sigma), config)[0] for sigma in (0.2, 4.0))
     assert np.median(noisy.depth_std) > 2.0 * np.median(quiet.depth_std)
+
+
+def test_tracks_at_one_place_do_not_make_depths_surer():
+    tracks, config = (
+        with_noise(isometric_bending(6, 30, seed=3).tracks, 1.0),
+        replace(default_config(), refinement=False),
+    )
+    once, _ = reconstruct(tracks, config)
+    twice, _ = reconstruct(tracks.select(points=[*range(30), 0, 1, 2]), config)
+    assert np.median(twice.depth_std) > 0.5 * np.median(once.depth_std)
