@@ -30,9 +30,10 @@ def log_chord_kernel(xi, yi, zi, xk, yk, zk):
 
     The arguments are the coordinates of both points in the camera frame; since X = z (x + q, 1), the derivative of a
     point with respect to its log depth is the point, and with respect to the ray correction z times the unit vector.
+    Of points at one place the derivatives are 0 and the length is next to nothing.
     """
     dx, dy, dz = xi - xk, yi - yk, zi - zk
-    square = dx * dx + dy * dy + dz * dz
+    square = max(dx * dx + dy * dy + dz * dz, 1e-300)
     gx, gy, gz = dx / square, dy / square, dz / square
     return (
         0.5 * np.log(square),

@@ -13,6 +13,9 @@ import numpy as np
 from connrsfm_graph.errors import InputError
 from connrsfm_graph.refine.thin_plate import fit_thin_plate
 
+_APART = 1e-5
+"""How far points at one place are moved from there, over the extent of the image points."""
+
 
 @dataclass(frozen=True)
 class Template:
@@ -31,7 +34,7 @@ class Completed:
     template: Template
     """All points on one plane."""
     image: np.ndarray
-    """(F, P, 2) image points, interpolated where not seen."""
+    """(F, P, 2) image points, interpolated where not seen, no two at one place."""
     log_depth: np.ndarray
     """(F, P) likewise."""
     deviation: np.ndarray
@@ -48,13 +51,16 @@ def complete(
         visible: (F, P) bool; every point in some view, every view with some point.
         log_depth: (F, P); where a visible one is NaN it is interpolated as well.
         template: of all points; made from these views where None.
+
+    Raises:
+        InputError: a view has fewer than two points with a depth, or none in common with the others.
     """
     template = template or make_template(image, visible)
     known = visible & np.isfinite(log_depth)
     log_depth = log_depth.copy()
     for f in range(len(visible)):
-        if not known[f].any():
-            raise InputError(f"refinement: image {f} has no point with a depth to start from")
+        if known[f].sum() < 2:
+            raise InputError(f"refinement: image {f} has fewer than two points with a depth to start from")
         if not known[f].all():
             surface = fit_thin_plate(template.position[known[f]], log_depth[f, known[f], None])
             log_depth[f, ~known[f]] = surface(template.position[~known[f]])[:, 0]
@@ -63,14 +69,28 @@ def complete(
 
 
 def complete_images(image: np.ndarray, visible: np.ndarray, template: Template) -> tuple[np.ndarray, np.ndarray]:
-    """Image points (F, P, 2) with those not seen interpolated, and the (F, P) deviations of these."""
+    """Image points (F, P, 2) with those not seen interpolated, and the (F, P) deviations of these.
+
+    No two points of a view are left at one place: of a chord without length nothing says where to it should grow.
+    """
     image, deviation, position = image.copy(), np.zeros(visible.shape), template.position
     for f, seen in enumerate(visible):
         if not seen.all():
             warp = fit_thin_plate(position[seen], image[f, seen])
             image[f, ~seen] = warp(position[~seen])
             deviation[f, ~seen] = np.hypot(warp.deviation(position[~seen]), template.deviation[~seen])
+        image[f] = _apart(image[f])
     return image, deviation
+
+
+def _apart(image: np.ndarray) -> np.ndarray:
+    """Points (P, 2), those at one place each moved a little in a direction of its own."""
+    _, place, count = np.unique(image, axis=0, return_inverse=True, return_counts=True)
+    together = np.flatnonzero(count[place.reshape(-1)] > 1)
+    direction = np.stack([np.cos(together), np.sin(together)], axis=1)
+    moved = image.copy()
+    moved[together] += _APART * np.ptp(image, axis=0).max() * direction
+    return moved
 
 
 def make_template(image: np.ndarray, visible: np.ndarray) -> Template:

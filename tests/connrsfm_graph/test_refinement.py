@@ -129,3 +129,19 @@ def test_bad_input_is_named() -> None:
         refine(image, hidden, depth, RefineConfig(), 1e-3)
     with pytest.raises(InputError, match=r"refine\.rings is 5"):
         RefineConfig(rings=5)
+
+
+@pytest.mark.parametrize("model", ["isometric", "conformal"])
+def test_tracks_may_meet_in_an_image(model):
+    """Neighbours on the same pixel of one image, one track given twice: surfaces of the others are as without."""
+    scene = isometric_bending(n_frames=6, n_points=60, seed=4)
+    image, log_depth = scene.image.copy(), scene.log_depth.copy()
+    near = np.linalg.norm(image[0] - image[0, :1], axis=1).argsort()
+    image[2, near[1]], log_depth[2, near[1]] = image[2, 0], log_depth[2, 0]
+    image[:, near[2]], log_depth[:, near[2]] = image[:, 0], log_depth[:, 0]
+    visible = np.ones(image.shape[:2], dtype=bool)
+    refined = refine(image, visible, log_depth, RefineConfig(model=model, outliers=False), 1e-4)
+    assert np.isfinite(refined.points).all()
+    others = np.setdiff1d(np.arange(60), near[:3])
+    error = refined.log_depth - scene.log_depth
+    assert np.median(np.abs(error - np.median(error, axis=1, keepdims=True))[:, others]) < 0.01

@@ -52,7 +52,7 @@ def test_a_view_without_depth_is_named():
     visible = np.ones((3, 12), dtype=bool)
     log_depth = np.zeros((3, 12))
     log_depth[1] = np.nan
-    with pytest.raises(InputError, match="image 1 has no point with a depth"):
+    with pytest.raises(InputError, match="image 1 has fewer than two points with a depth"):
         complete(np.random.default_rng(0).uniform(size=(3, 12, 2)), visible, log_depth)
 
 
@@ -61,3 +61,10 @@ def test_a_point_seen_nowhere_is_named():
     visible[:, 5] = False
     with pytest.raises(InputError, match="point 5 is seen in no image"):
         complete(np.random.default_rng(0).uniform(size=(3, 12, 2)), visible, np.zeros((3, 12)))
+
+
+def test_a_view_needs_two_points():
+    image, visible = np.random.default_rng(2).normal(size=(2, 6, 2)), np.ones((2, 6), dtype=bool)
+    visible[1, 1:] = False
+    with pytest.raises(InputError, match="image 1 has fewer than two points"):
+        complete(image, visible, np.zeros((2, 6)))
