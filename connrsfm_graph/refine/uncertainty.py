@@ -105,6 +105,7 @@ def _variance_kernel(
         square[v] = 0.0
         if not factor_damped(matrix, 0.0, envelope.first, envelope.start):
             square[v] = np.nan
+            continue
         for s in range(len(lengths)):
             gradient[:] = 0.0
             for e in range(E):
