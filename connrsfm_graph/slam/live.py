@@ -182,10 +182,13 @@ def fuse_live(
         background: image points (F, B, 2), normalised, and visibility (F, B) of points that do not move.
 
     Raises:
-        InputError: a view cannot be used, or numbers of views do not fit.
+        InputError: a view cannot be used, an image point is not finite, or numbers of views do not fit.
     """
     config = config or SlamConfig()
     F, K = len(image), first.n_views
+    wrong = (visible & ~np.isfinite(image).all(axis=-1)).any(axis=1)
+    if wrong.any():  # which would pass for too little of the surface
+        raise InputError(f"view {int(wrong.argmax())}: an image point is NaN where 'visible' is true")
     if background is not None and len(background[1]) != F:
         raise InputError(f"the background is tracked through {len(background[1])} views, the points through {F}")
     sigmas = None if steps is None else config.odometry_sigmas(steps)

@@ -141,3 +141,11 @@ def test_a_view_that_shows_too_little_of_the_surface_is_held_by_odometry(scene, 
     np.testing.assert_allclose(live.fusion.pose(K + 1), live.fusion.pose(K) @ steps[K], atol=0.05)
     with pytest.raises(InputError, match=f"view {K + 1}: it shares fewer than 10 tracks"):
         fuse_live(first, image, seen, pose=scene.poses[0])
+
+
+def test_an_image_point_that_is_not_a_number_is_no_lack_of_surface(scene, image):
+    steps, _ = noisy_odometry(scene.poses, seed=5)
+    spoilt = image.copy()
+    spoilt[K + 2, np.flatnonzero(scene.visible[K + 2])[0]] = np.nan
+    with pytest.raises(InputError, match=f"view {K + 2}: an image point is NaN"):
+        fuse_live(first_views(scene, image, scene.visible), spoilt, scene.visible, None, steps)
