@@ -42,7 +42,7 @@ def read_toml(config: C, path: str | Path) -> C:
 
 
 def override(config: C, assignments: Iterable[str]) -> C:
-    """`config` after assignments such as `solve.max_iterations=50`, from left to right.
+    """`config` after assignments such as `refine.iterations=50`, from left to right.
 
     Raises:
         InputError: no equals sign, an unknown key or a value of the wrong type.

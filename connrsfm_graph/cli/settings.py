@@ -34,7 +34,7 @@ def add_configuration(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="KEY=VALUE",
-        help="one setting, such as solve.max_iterations=50; may be repeated (connrsfm settings lists all)",
+        help="one setting, such as refine.iterations=50; may be repeated (connrsfm settings lists all)",
     )
     parser.add_argument("--seed", type=int, help="seed of every random choice")
 

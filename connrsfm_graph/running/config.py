@@ -62,4 +62,4 @@ def parsed_size(text: str) -> int:
             return int(float(match[1]) * _UNITS[match[2]])
     except (KeyError, ValueError):
         pass
-    raise InputError(f"memory limit '{text}' is no size, expected a number with a unit such as 4GiB or 500MB")
+    raise InputError(f"running.memory_limit: '{text}' is no size, expected a number with a unit such as 4GiB or 500MB")

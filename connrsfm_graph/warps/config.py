@@ -27,9 +27,9 @@ class WarpConfig:
     padding: float = 0.1
     """Widening of the spline's rectangle beyond the points, as a fraction of its size, on every side."""
     schwarzian: float | None = 0.1
-    """Weight of the Schwarzian penalty; None chooses the one that predicts left-out points best."""
+    """Weight of the Schwarzian penalty; none: chosen as the one that predicts left-out points best."""
     bending: float | None = None
-    """Weight of the bending energy of `bending`; None chooses the one that predicts left-out points best."""
+    """Weight of the bending energy of `bending`; none: chosen as the one that predicts left-out points best."""
     shortest_scale: float = 1.0
     """Shortest length scale of the Gaussian process, in units of the spread of the points. Finer detail counts as noise
     in a warp, whose second derivatives it would ruin."""
