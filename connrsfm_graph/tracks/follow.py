@@ -82,8 +82,13 @@ def track_images(
         names.append(name)
         if progress is not None:
             progress(len(names), max(total, len(names)))
+    surplus = None if mask_images is None else next(mask_images, None)
+    if surplus is not None:
+        raise InputError(f"mask {surplus[0]}: has no image, expected as many masks as images")
     if len(names) < MIN_FRAMES:
         shown = "1 image" if len(names) == 1 else f"{len(names)} images"
+        if chosen != (1, 0, None):
+            shown += " in the part chosen by first, last and every"
         raise InputError(f"{_named(source)}: shows {shown}, expected at least {MIN_FRAMES} of a surface that moves")
     return Tracks.checked(follower.tracks(), intrinsics, image_names=names, source="tracked images")
 

@@ -128,6 +128,8 @@ def test_masks_keep_tracks_on_the_object(rendered: tuple[RenderedSequence, Path]
     assert np.nanmin(ab[..., 0]) > 0
     with pytest.raises(InputError, match=r"003\.png: has no mask"):
         track_images(folder, sequence.K, masks=sorted(masks.iterdir())[:3])
+    with pytest.raises(InputError, match=r"mask 011\.png: has no image"):
+        track_images(sorted(folder.iterdir())[:-1], sequence.K, masks=masks)
     small = write_all(tmp_path / "small", [np.full((10, 20), 255, np.uint8)] * 12)
     with pytest.raises(InputError, match=r"mask 000\.png: has 20 x 10 pixels, expected the 480 x 360"):
         track_images(folder, sequence.K, masks=small)
