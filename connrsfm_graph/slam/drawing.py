@@ -32,7 +32,8 @@ def write_drawing(path: str | Path, problem: FusionProblem, most: int = MOST_GRO
     F = problem.sightings.n_views
     size = -(-F // most)
     group = np.arange(F) // size
-    lines = ["graph fusion {", "  rankdir=LR;", "  node [shape=box, fontname=Helvetica];", "  edge [fontsize=9];"]
+    lines = ["graph fusion {", "  rankdir=LR;", "  fontname=Helvetica;"]
+    lines += ["  node [shape=box, fontname=Helvetica];", "  edge [fontname=Helvetica, fontsize=9];"]
     for name, label in (("camera", "cameras: pose and scale"), ("surface", "map points")):
         lines += [f"  subgraph cluster_{name} {{", f'    label="{label}";']
         for n in range(int(group[-1]) + 1):

@@ -80,9 +80,10 @@ def full_graph(
     return graph, values
 
 
-def write_dot(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, path: Path) -> None:
+def write_dot(graph: gtsam.NonlinearFactorGraph, path: Path) -> None:
     """Write a graph in Graphviz' dot language, variables named in words."""
-    path.write_text(graph.dot(values, keys.describe), encoding="utf-8")
+    no_places = gtsam.Values()  # GTSAM would place variables in the drawing by what their values are
+    path.write_text(graph.dot(no_places, keys.describe), encoding="utf-8")
 
 
 def marginal_covariances(

@@ -184,5 +184,5 @@ def test_full_graph_is_the_sum_of_the_points(tmp_path):
     assert graph.size() == (problem.weight > 0).sum()
     costs = BATCHED.minimise(problem, state, ("d",), PairNoise(), settings=Levenberg(max_iterations=0)).cost
     assert graph.error(values) == pytest.approx(costs.sum(), rel=1e-12)
-    write_dot(graph, values, tmp_path / "graph.dot")
+    write_dot(graph, tmp_path / "graph.dot")
     assert "first-order terms of point 0, view 1" in (tmp_path / "graph.dot").read_text()
