@@ -175,9 +175,10 @@ def _reconstruction(arguments: argparse.Namespace, tracks: Tracks, progress: Pro
     if arguments.result is not None:
         loaded = Reconstruction.load(arguments.result)
         if loaded.visible.shape != tracks.visible.shape:
+            part = "" if arguments.live is None else f"the first {tracks.n_frames} views of "
             raise InputError(
                 f"{arguments.result}: holds {loaded.n_frames} images and {loaded.n_points} points, expected those of "
-                f"{arguments.tracks} ({tracks.n_frames} and {tracks.n_points})"
+                f"{part}{arguments.tracks} ({tracks.n_frames} and {tracks.n_points})"
             )
         return loaded
     tracks, _ = check_reconstructable(tracks, str(arguments.tracks))
