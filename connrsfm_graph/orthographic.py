@@ -28,6 +28,7 @@ from connrsfm_graph.integrate import IntegrationConfig, integrate
 from connrsfm_graph.problem import Problem, State, flat_state
 from connrsfm_graph.reconstruction import Reconstruction
 from connrsfm_graph.refine import RefineConfig, Refined, refine
+from connrsfm_graph.refine.uncertainty import log_depth_deviation
 from connrsfm_graph.solvers.interface import Backend, Levenberg, PairModel
 from connrsfm_graph.tracks import Tracks
 from factors.noise import PairNoise
@@ -246,12 +247,20 @@ def refine_from_afar(
     sigma_image: float,
     progress: Callable[[int, int], None] | None = None,
 ) -> Refined:
-    """As `refine`, with depths (F, P) in place of their logarithms; the result's depths are about their mean.
+    """As `refine`, with depths (F, P) in place of their logarithms; the result's depths are about their mean, and so
+    are their standard deviations.
 
     Each image comes in the unit of its own image points, whatever scale the lengths shared by all asked for.
     """
     log_depth = np.log1p((depth - np.nanmean(depth, axis=1, keepdims=True)) / DISTANCE)
-    return _brought_back(refine(image / DISTANCE, visible, log_depth, config, sigma_image / DISTANCE, progress))
+    bare = replace(config, uncertainty=False)
+    refined = refine(image / DISTANCE, visible, log_depth, bare, sigma_image / DISTANCE, progress)
+    if config.uncertainty:
+        fit = refined.reference.fit
+        deviation = log_depth_deviation(fit.measurements, fit.shape, stretch=not fit.noisy, about_mean=True)
+        depth_std = refined.reference.all_points(deviation * np.exp(fit.shape.log_depth))
+        refined = replace(refined, depth_std=depth_std)
+    return _brought_back(refined)
 
 
 def _brought_back(refined: Refined) -> Refined:

@@ -32,7 +32,12 @@ _SMOOTHINGS = 4
 
 
 def log_depth_deviation(
-    measurements: Measurements, shape: Shape, stretch: bool, jointly: bool = True, seed: int = 0
+    measurements: Measurements,
+    shape: Shape,
+    stretch: bool,
+    jointly: bool = True,
+    about_mean: bool = False,
+    seed: int = 0,
 ) -> np.ndarray:
     """(F, P) standard deviation of log depth, the scale common to all views left out.
 
@@ -42,16 +47,21 @@ def log_depth_deviation(
         stretch: whether lengths vary alike for neighbours.
         jointly: whether the views were fitted together with the lengths. Else the lengths are taken as known, views do
             not depend on each other, and all have the same draws.
+        about_mean: whether the mean of every view is left out as well, which views from afar do not tell; of views
+            fitted together only.
         seed: of the draws.
     """
     draws = _draws(np.random.default_rng(seed), len(shape.log_depth) if jointly else 1, measurements.mesh, stretch)
-    variance = (_variance_of_all if jointly else _variance_of_each)(measurements, shape, draws)
+    if jointly:
+        variance = _variance_of_all(measurements, shape, draws, about_mean)
+    else:
+        variance = _variance_of_each(measurements, shape, draws)
     # Variances vary slowly over the surface, their estimates from a few draws do not.
     return np.asarray(np.sqrt(_around(variance, measurements.mesh)))
 
 
 def _variance_of_all(
-    measurements: Measurements, shape: Shape, draws: Iterator[tuple[np.ndarray, np.ndarray]]
+    measurements: Measurements, shape: Shape, draws: Iterator[tuple[np.ndarray, np.ndarray]], about_mean: bool
 ) -> np.ndarray:
     """(F, P) mean squares of the log depths' errors, views and lengths solved together."""
     envelope = measurements.envelope(shape.log_factor.size > 0)
@@ -65,7 +75,10 @@ def _variance_of_all(
         gradient = -factorised.spread(noise)
         gradient[..., rays] += measurements.image_weight[..., None] * images
         views, _ = factorised.solve(gradient, -(equations.weight * noise).sum(axis=1), _TOLERANCE)
-        square += (views[..., envelope.unknown] ** 2).sum(axis=0)
+        error = views[..., envelope.unknown]
+        if about_mean:
+            error = error - error.mean(axis=-1, keepdims=True)
+        square += (error**2).sum(axis=0)
     return square / _SAMPLES
 
 

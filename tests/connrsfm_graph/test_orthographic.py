@@ -169,6 +169,20 @@ def test_the_refinement_from_afar_leaves_the_truth_alone(smooth: Tracks) -> None
     np.testing.assert_allclose(refined.points[..., 2], depth - depth.mean(axis=1, keepdims=True), atol=5e-3)
 
 
+def test_depths_refined_from_afar_are_about_as_sure_as_they_say(smooth: Tracks) -> None:
+    """The distance of a view, of which the camera sees nothing, is no part of it."""
+    image = smooth.normalised()
+    depth = smooth.points[..., 2] - smooth.points[..., 2].mean(axis=1, keepdims=True)
+    sigma = 2e-3
+    noisy = image + np.random.default_rng(0).normal(scale=sigma, size=image.shape)
+    refined = refine_from_afar(noisy, smooth.visible, depth, RefineConfig(), sigma)
+    error = (refined.points[..., 2] - depth) / refined.depth_std
+    assert 0.3 < (error**2).mean() < 3.0
+    assert np.isnan(
+        refine_from_afar(noisy, smooth.visible, depth, RefineConfig(uncertainty=False), sigma).depth_std
+    ).all()
+
+
 def test_files_keep_the_camera(result: Reconstruction, smooth: Tracks, tmp_path: Path) -> None:
     save_tracks(tmp_path / "tracks.npz", smooth)
     assert load_tracks(tmp_path / "tracks.npz").camera is ORTHOGRAPHIC
