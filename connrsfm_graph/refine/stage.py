@@ -128,7 +128,8 @@ def _refined(found: Fit, config: RefineConfig, reference: Reference, outlier: np
     group = np.zeros(len(seen), dtype=int) if found.ambiguity is None else found.ambiguity.group
     if group.any():
         warnings.append(
-            f"views {np.flatnonzero(group).tolist()} may be inverted about the camera centre: the tracks cannot tell, "
+            f"views {np.flatnonzero(group).tolist()} may be inverted about the camera centre (of an orthographic "
+            "camera: mirrored in depth): the tracks cannot tell, "
             f"the choice rests on the assumption that {found.ambiguity.assumption}"  # type: ignore[union-attr]
         )
     return Refined(

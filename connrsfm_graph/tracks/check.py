@@ -49,8 +49,9 @@ def check_reconstructable(tracks: Tracks, source: str = "tracks") -> tuple[Track
             image, or no point seen twice.
     """
     if tracks.n_frames < MIN_FRAMES:
+        shown = "1 image" if tracks.n_frames == 1 else f"{tracks.n_frames} images"
         raise InputError(
-            f"{source}: shows {tracks.n_frames} images, expected at least {MIN_FRAMES} because two views of a bending "
+            f"{source}: shows {shown}, expected at least {MIN_FRAMES} because two views of a bending "
             "surface leave its normals ambiguous"
         )
     if tracks.n_points < MIN_POINTS:
