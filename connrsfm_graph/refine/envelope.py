@@ -13,8 +13,9 @@ from numba import njit
 
 _TILE = 3
 """Rows that are factored at a time."""
-_SUMS = {"reassoc", "contract", "arcp", "nsz"}
-"""What compiled code may do to sums, so that they are vectorised."""
+SUMS = {"reassoc", "contract", "arcp", "nsz"}
+"""What compiled code may do to sums, so that they are vectorised; for kernels around the functions below, which are put
+into these as source, since what is made of a function depends on whether it was compiled now or came from the cache."""
 
 
 class Envelope(NamedTuple):
@@ -156,7 +157,7 @@ def _below(row, at, s0, s1, s2, b1, b2, inverse):
     row[at + 2] = (row[at + 2] - s2 - x0 * b2[at] - x1 * b2[at + 1]) * inverse[2]
 
 
-@njit(cache=True, nogil=True, fastmath=_SUMS)
+@njit(cache=True, inline="always")
 def factor_damped(A, damping, first, start):
     """Multiply the diagonal of one view's matrix by 1 + damping and factor in place; false where that fails."""
     for r in range(len(first)):
@@ -164,14 +165,14 @@ def factor_damped(A, damping, first, start):
     return _factor_view(A, first, start)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=SUMS)
 def factor_kernel(begin, end, matrix, damping, first, start, fine):
     """`factor_damped` of views begin to end - 1; `fine` (F,) says whether that succeeded."""
     for f in range(begin, end):
         fine[f] = factor_damped(matrix[f], damping, first, start)
 
 
-@njit(cache=True, nogil=True, fastmath=_SUMS)
+@njit(cache=True, inline="always")
 def substitute(L, first, start, x):
     """Solve L L' y = x in place, for one view."""
     n = len(first)
@@ -186,7 +187,7 @@ def substitute(L, first, start, x):
             above[k] -= left[k] * s
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=SUMS)
 def solve_kernel(begin, end, factor, first, start, x):
     """x_sf = H_f^-1 x_sf in place for views begin to end - 1 and all right-hand sides, x (S, F, n)."""
     for f in range(begin, end):
