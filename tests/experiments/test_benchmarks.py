@@ -70,7 +70,7 @@ def test_pages_show_what_was_measured(tmp_path):
 
 @pytest.mark.slow
 def test_iterations_are_compared(tmp_path):
-    measure_iteration(tmp_path, frames=6, points=8, repeats=1)
+    measure_iteration(tmp_path, frames=6, points=8, repeats=5)
     with (tmp_path / "iteration.csv").open() as file:
         rows = list(csv.DictReader(file))
     ratio = {(row["iteration"], row["solver"]): float(row["times batched"]) for row in rows}
