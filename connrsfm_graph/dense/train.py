@@ -44,7 +44,8 @@ class TrainConfig:
     noise: float = 0.25
     """Largest standard deviation of the noise on the components of unit normals; 0 trains without augmentation."""
     rate: float | None = None
-    """Adam's largest step size, None the variant's; it rises first, and falls to 0 over the last `decay` of them."""
+    """Adam's largest step size, None the variant's; steps are smaller at first, and fall to 0 over the last `decay` of
+    the training."""
     decay: float = 0.4
     """Part of the steps over which the step size falls."""
     seed: int = 0

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from connrsfm_graph.refine import RefineConfig
+from connrsfm_graph.refine import RefineConfig, refine
 from connrsfm_graph.refine.fit import Task
 from connrsfm_graph.refine.held_out import prediction_errors, predicts_better
 from connrsfm_graph.refine.noise import Noise
@@ -71,3 +71,20 @@ def test_chance_is_not_better() -> None:
     assert predicts_better(0.9 * errors, errors)
     assert not predicts_better(errors, wild * 0.9)  # gross errors do not decide
     assert not predicts_better(errors[:1] - 1, errors[:1])
+
+
+def test_exact_data_are_beyond_doubt(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They leave nothing that points left out could tell."""
+
+    def never(*arguments: object) -> np.ndarray:
+        raise AssertionError("points were left out")
+
+    monkeypatch.setattr("connrsfm_graph.refine.fit.prediction_errors", never)
+    scene = isometric_bending(n_frames=6, n_points=60, seed=1)
+    image, seen = scene.tracks.normalised(), scene.tracks.visible
+    found = refine(image, seen, scene.log_depth, RefineConfig(uncertainty=False), 1e-6)
+    assert found.evidence["length noise"] == RefineConfig().length_sigma
+    noisy = with_noise(scene.tracks, PIXELS, seed=1)
+    sigma = PIXELS / noisy.focal_length()
+    with pytest.raises(AssertionError, match="points were left out"):
+        refine(noisy.normalised(), seen, scene.log_depth, RefineConfig(uncertainty=False), sigma)
