@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import importlib
+import pkgutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from numba.core.dispatcher import Dispatcher
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -46,3 +49,16 @@ def test_factors_do_not_know_the_pipeline():
     )
     done = _run("-c", code)
     assert done.returncode == 0, done.stderr
+
+
+def test_no_compiled_code_reorders_sums():
+    """Its bits would depend on which parts of it came from the cache, and so differ between workers."""
+    found = []
+    for package in ("connrsfm_graph", "factors"):
+        for module in pkgutil.walk_packages([str(ROOT / package)], f"{package}."):
+            if not module.name.endswith("__main__"):
+                found += [
+                    item for item in vars(importlib.import_module(module.name)).values() if isinstance(item, Dispatcher)
+                ]
+    assert len(found) > 50
+    assert not [function.__name__ for function in found if function.targetoptions.get("fastmath")]

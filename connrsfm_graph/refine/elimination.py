@@ -19,7 +19,7 @@ import numpy as np
 from numba import njit
 
 from connrsfm_graph.errors import ComputationError
-from connrsfm_graph.refine.envelope import SUMS, Envelope, factor_kernel, solve_kernel, substitute
+from connrsfm_graph.refine.envelope import Envelope, factor_kernel, solve_kernel, substitute
 from connrsfm_graph.threads import over_views
 
 
@@ -81,7 +81,7 @@ def _gather_all(begin, end, border, weight, ends, x, out):
             _gather(border[f], weight[f], ends, x[s, f], out[f, s])
 
 
-@njit(cache=True, nogil=True, fastmath=SUMS)
+@njit(cache=True, nogil=True)
 def _schur_terms(begin, end, factor, first, start, border, weight, ends, v, out):
     """out_fs = W_f' H_f^-1 W_f v_s for views begin to end - 1."""
     for f in range(begin, end):

@@ -11,11 +11,10 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from connrsfm_graph.refine.sums import sums_of_products
+
 _TILE = 3
 """Rows that are factored at a time."""
-SUMS = {"reassoc", "contract", "arcp", "nsz"}
-"""What compiled code may do to sums, so that they are vectorised; for kernels around the functions below, which are put
-into these as source, since what is made of a function depends on whether it was compiled now or came from the cache."""
 
 
 class Envelope(NamedTuple):
@@ -51,16 +50,12 @@ def make_envelope(order: np.ndarray, cliques: list[np.ndarray], size: int) -> En
     return Envelope(first, start, size * order)
 
 
-# Kernels run along slices from zero, so that the compiler sees no negative index and uses vector instructions.
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def _dot(a, b):
-    s = 0.0
-    for k in range(len(a)):
-        s += a[k] * b[k]
-    return s
+    return sums_of_products((a,), (b,), len(a))[0]
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def _factor_view(A, first, start):
     """Cholesky factor in place; false where A is not positive definite. Rows left over by tiles go one by one."""
     inverse = np.empty(len(first))  # of the diagonal: divisions would take as long as the sums
@@ -84,7 +79,7 @@ def _factor_view(A, first, start):
     return True
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def _factor_tile(A, first, start, R, inverse):
     """Rows R to R + 2 of the factor: three rows and three columns at a time read every number once for three products.
 
@@ -100,30 +95,13 @@ def _factor_tile(A, first, start, R, inverse):
         b0 = A[start[C] + skip : start[C + 1]]
         b1 = A[start[C + 1] + skip : start[C + 2]]
         b2 = A[start[C + 2] + skip : start[C + 3]]
-        s00 = s01 = s02 = s10 = s11 = s12 = s20 = s21 = s22 = 0.0
-        for k in range(size):
-            s00 += a0[k] * b0[k]
-            s01 += a0[k] * b1[k]
-            s02 += a0[k] * b2[k]
-            s10 += a1[k] * b0[k]
-            s11 += a1[k] * b1[k]
-            s12 += a1[k] * b2[k]
-            s20 += a2[k] * b0[k]
-            s21 += a2[k] * b1[k]
-            s22 += a2[k] * b2[k]
+        s00, s01, s02, s10, s11, s12, s20, s21, s22 = sums_of_products((a0, a1, a2), (b0, b1, b2), size)
         of_tile = inverse[C : C + 3]
         _below(a0, size, s00, s01, s02, b1, b2, of_tile)
         _below(a1, size, s10, s11, s12, b1, b2, of_tile)
         _below(a2, size, s20, s21, s22, b1, b2, of_tile)
     m = R - low
-    s00 = s10 = s11 = s20 = s21 = s22 = 0.0
-    for k in range(m):
-        s00 += x0[k] * x0[k]
-        s10 += x1[k] * x0[k]
-        s11 += x1[k] * x1[k]
-        s20 += x2[k] * x0[k]
-        s21 += x2[k] * x1[k]
-        s22 += x2[k] * x2[k]
+    s00, _, _, s10, s11, _, s20, s21, s22 = sums_of_products((x0, x1, x2), (x0, x1, x2), m)
     pivot = x0[m] - s00
     if not pivot > 0.0:
         return False
@@ -145,7 +123,7 @@ def _factor_tile(A, first, start, R, inverse):
     return True
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def _below(row, at, s0, s1, s2, b1, b2, inverse):
     """Three entries of a row from `at` on: (row - s) L^-T, L the lower triangle of the rows b from `at` on.
 
@@ -157,7 +135,7 @@ def _below(row, at, s0, s1, s2, b1, b2, inverse):
     row[at + 2] = (row[at + 2] - s2 - x0 * b2[at] - x1 * b2[at + 1]) * inverse[2]
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def factor_damped(A, damping, first, start):
     """Multiply the diagonal of one view's matrix by 1 + damping and factor in place; false where that fails."""
     for r in range(len(first)):
@@ -165,14 +143,14 @@ def factor_damped(A, damping, first, start):
     return _factor_view(A, first, start)
 
 
-@njit(cache=True, nogil=True, fastmath=SUMS)
+@njit(cache=True, nogil=True)
 def factor_kernel(begin, end, matrix, damping, first, start, fine):
     """`factor_damped` of views begin to end - 1; `fine` (F,) says whether that succeeded."""
     for f in range(begin, end):
         fine[f] = factor_damped(matrix[f], damping, first, start)
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def substitute(L, first, start, x):
     """Solve L L' y = x in place, for one view."""
     n = len(first)
@@ -187,7 +165,7 @@ def substitute(L, first, start, x):
             above[k] -= left[k] * s
 
 
-@njit(cache=True, nogil=True, fastmath=SUMS)
+@njit(cache=True, nogil=True)
 def solve_kernel(begin, end, factor, first, start, x):
     """x_sf = H_f^-1 x_sf in place for views begin to end - 1 and all right-hand sides, x (S, F, n)."""
     for f in range(begin, end):

@@ -10,7 +10,7 @@ from numba import njit
 
 from connrsfm_graph.refine.cost import linearise_view, view_cost
 from connrsfm_graph.refine.curvature import arc_offsets
-from connrsfm_graph.refine.envelope import SUMS, factor_damped, substitute
+from connrsfm_graph.refine.envelope import factor_damped, substitute
 
 
 @njit(cache=True, inline="always")
@@ -23,7 +23,7 @@ def _place(image, log_depth, correction, X):
         X[i, 2] = depth
 
 
-@njit(cache=True, nogil=True, fastmath=SUMS)
+@njit(cache=True, nogil=True)
 def fit_views_kernel(
     first, last, image, image_weight, anchor, length_weight, factor_weight, triangles, terms, envelope, iterations,
     tolerance, exact, damping_range, log_depth, correction, log_factor, cost,

@@ -17,7 +17,7 @@ from numba import njit
 
 from connrsfm_graph.refine.cost import linearise_view
 from connrsfm_graph.refine.elimination import Factorised, spread_view
-from connrsfm_graph.refine.envelope import SUMS, factor_damped, substitute
+from connrsfm_graph.refine.envelope import factor_damped, substitute
 from connrsfm_graph.refine.mesh import Mesh
 from connrsfm_graph.refine.solve import Measurements, Shape, kernel_arguments, lag, linearise
 from connrsfm_graph.threads import over_views
@@ -94,7 +94,7 @@ def _variance_of_each(
     return square
 
 
-@njit(cache=True, nogil=True, fastmath=SUMS)
+@njit(cache=True, nogil=True)
 def _variance_kernel(
     first, last, X, f, drift, offset, correction, image_weight, length_weight, factor_weight, terms, envelope,
     lengths, images, square,
