@@ -166,6 +166,8 @@ def _reconstruct(
     if n_following:
         decisions["running"] = {"processes at work": max(len(peaks), 1), "images in a block": plan.block}
     warnings = [*problem_warnings((*account.problems, *gathering.problems())), *account.warnings]
+    if config.running.cluster is not None and not n_following:
+        warnings.append(f"the cluster was not asked: all {tracks.n_frames} images are reconstructed jointly, here")
     peak = peak_memory_mib() + sum(peaks.values())
     if config.running.memory_limit is not None and peak * 2**20 > config.running.memory():
         warnings.append(f"the run took {peak:.0f} MiB, more than running.memory_limit ({config.running.memory_limit})")

@@ -48,6 +48,8 @@ class Checkpoints:
         folder = check_output_folder(out.absolute().with_name(f"{out.absolute().name}.partial"))
         wanted, known = fingerprint(tracks, config), folder / _FINGERPRINT
         if not (resume and known.exists()):
+            if resume:
+                print(f"--resume: there is no {folder} to go on from, so the run begins anew", file=sys.stderr)
             shutil.rmtree(folder, ignore_errors=True)
             with written_beside(known) as part:
                 part.write_text(wanted, encoding="utf-8")

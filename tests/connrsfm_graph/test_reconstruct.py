@@ -12,6 +12,7 @@ from connrsfm_graph.config import override
 from connrsfm_graph.errors import InputError
 from connrsfm_graph.metrics import evaluate
 from connrsfm_graph.reconstruct import Config, default_config, reconstruct
+from connrsfm_graph.running.config import RunningConfig
 from connrsfm_graph.synthetic import isometric_bending, spheres, with_missing, with_noise
 from connrsfm_graph.tracks import Tracks, load_tracks
 from factors.surface import PERSPECTIVE, metric
@@ -129,3 +130,9 @@ def test_camera_points_project_to_the_tracks(bent):
     image = scene.tracks.normalised()
     expected = PERSPECTIVE.points(image, result.depth)
     assert np.abs(result.points - expected).max() < 1e-3 * np.abs(expected).max()
+
+
+def test_a_cluster_that_is_not_needed_is_not_asked():
+    tracks = isometric_bending(n_frames=4, n_points=40).tracks
+    _, record = reconstruct(tracks, Config(running=RunningConfig(cluster="tcp://nowhere:1")))
+    assert "the cluster was not asked: all 4 images are reconstructed jointly, here" in record.warnings

@@ -73,3 +73,12 @@ def test_an_error_tells_what_can_be_resumed(work, tmp_path, capsys):
         raise KeyboardInterrupt
     assert "out.partial keeps what is finished; --resume goes on" in capsys.readouterr().err
     assert kept.folder.exists()
+
+
+def test_nothing_to_resume_is_said(work, tmp_path, capsys):
+    Checkpoints.beside(tmp_path / "out", work.tracks, FEW, resume=False)
+    Checkpoints.beside(tmp_path / "out", work.tracks, FEW, resume=True)
+    assert not capsys.readouterr().err
+    Checkpoints.beside(tmp_path / "other", work.tracks, FEW, resume=True)
+    assert "there is no" in (said := capsys.readouterr().err)
+    assert "other.partial to go on from" in said
