@@ -26,9 +26,10 @@ from connrsfm_graph.orthographic import in_own_unit, in_unit_of, refine_from_afa
 from connrsfm_graph.others import Guide
 from connrsfm_graph.problem import Problem, make_problem
 from connrsfm_graph.progress import Progress
-from connrsfm_graph.reconstruction import Reconstruction, RunRecord, package_versions, peak_memory_mib
+from connrsfm_graph.reconstruction import Reconstruction
 from connrsfm_graph.record import Account, account_of, problem_warnings
 from connrsfm_graph.refine import RefineConfig, Refined, refine
+from connrsfm_graph.run_record import RunRecord, package_versions, peak_memory_mib
 from connrsfm_graph.running.checkpoints import Checkpoints
 from connrsfm_graph.running.config import RunningConfig
 from connrsfm_graph.running.crew import Here, Plan, assembled

@@ -17,7 +17,8 @@ from connrsfm_graph.errors import InputError
 if TYPE_CHECKING:
     from connrsfm_graph.progress import Progress
     from connrsfm_graph.reconstruct import Config
-    from connrsfm_graph.reconstruction import Reconstruction, RunRecord
+    from connrsfm_graph.reconstruction import Reconstruction
+    from connrsfm_graph.run_record import RunRecord
     from connrsfm_graph.tracks import Tracks
 
     Method = Callable[[Tracks, Config, Progress], tuple[Reconstruction, RunRecord]]

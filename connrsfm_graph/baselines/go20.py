@@ -16,7 +16,8 @@ from dataclasses import replace
 from connrsfm_graph.progress import Progress
 from connrsfm_graph.reconstruct import Config, default_config
 from connrsfm_graph.reconstruct import reconstruct as main_job
-from connrsfm_graph.reconstruction import Reconstruction, RunRecord
+from connrsfm_graph.reconstruction import Reconstruction
+from connrsfm_graph.run_record import RunRecord
 from connrsfm_graph.tracks import Tracks
 
 

@@ -22,7 +22,8 @@ from connrsfm_graph.baselines.polynomial import affine, global_minimum, product
 from connrsfm_graph.baselines.star import Star, reconstruct_star
 from connrsfm_graph.progress import Progress
 from connrsfm_graph.reconstruct import Config
-from connrsfm_graph.reconstruction import Reconstruction, RunRecord
+from connrsfm_graph.reconstruction import Reconstruction
+from connrsfm_graph.run_record import RunRecord
 from connrsfm_graph.tracks import Tracks
 
 

@@ -16,7 +16,8 @@ from connrsfm_graph.baselines.inextensible import InextensibleProgramme
 from connrsfm_graph.baselines.outcome import outcome
 from connrsfm_graph.progress import Progress
 from connrsfm_graph.reconstruct import Config
-from connrsfm_graph.reconstruction import Reconstruction, RunRecord
+from connrsfm_graph.reconstruction import Reconstruction
+from connrsfm_graph.run_record import RunRecord
 from connrsfm_graph.tracks import Tracks
 
 NEIGHBOURS = 12

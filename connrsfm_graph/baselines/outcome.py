@@ -9,7 +9,8 @@ import numpy as np
 
 from connrsfm_graph.errors import ComputationError
 from connrsfm_graph.progress import Progress
-from connrsfm_graph.reconstruction import Reconstruction, RunRecord, package_versions, peak_memory_mib
+from connrsfm_graph.reconstruction import Reconstruction
+from connrsfm_graph.run_record import RunRecord, package_versions, peak_memory_mib
 from connrsfm_graph.surface_spline import terms_of_depth
 from connrsfm_graph.tracks import Tracks
 from factors.surface import PERSPECTIVE, normals

@@ -21,7 +21,8 @@ from connrsfm_graph.config import as_dict
 from connrsfm_graph.integrate import IntegrationConfig, integrate
 from connrsfm_graph.problem import Problem, flat_state
 from connrsfm_graph.progress import Progress
-from connrsfm_graph.reconstruction import Reconstruction, RunRecord
+from connrsfm_graph.reconstruction import Reconstruction
+from connrsfm_graph.run_record import RunRecord
 from connrsfm_graph.tracks import Tracks
 from connrsfm_graph.warps import WarpConfig, Warps, fit_warps
 from factors.warp_jet import PAIR_DATA_SIZE

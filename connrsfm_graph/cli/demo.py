@@ -23,8 +23,9 @@ def run(arguments: argparse.Namespace) -> None:
     from connrsfm_graph.dense.layout import DENSE_FOLDER, SEQUENCE_FILE
     from connrsfm_graph.files import check_output_folder, folder_written_beside
     from connrsfm_graph.progress import Progress
-    from connrsfm_graph.reconstruction import Reconstruction, RunRecord
+    from connrsfm_graph.reconstruction import Reconstruction
     from connrsfm_graph.report.page import write_report
+    from connrsfm_graph.run_record import RunRecord
     from connrsfm_graph.synthetic.rendered import render_sequence
     from connrsfm_graph.tracks import save_tracks
     from connrsfm_graph.tracks.front_end import images_to_tracks

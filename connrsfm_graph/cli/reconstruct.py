@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 
     from connrsfm_graph.progress import Progress
     from connrsfm_graph.reconstruct import Config
-    from connrsfm_graph.reconstruction import Reconstruction, RunRecord
+    from connrsfm_graph.reconstruction import Reconstruction
+    from connrsfm_graph.run_record import RunRecord
     from connrsfm_graph.tracks import Tracks
 
 CONFIG_FILE = "config.toml"
@@ -111,8 +112,9 @@ def reconstruct_into(
     from connrsfm_graph.errors import InputError
     from connrsfm_graph.files import folder_written_beside
     from connrsfm_graph.methods import METHODS
-    from connrsfm_graph.reconstruction import RECORD_FILE, RESULT_FILE
+    from connrsfm_graph.reconstruction import RESULT_FILE
     from connrsfm_graph.report.page import remove_report
+    from connrsfm_graph.run_record import RECORD_FILE
     from connrsfm_graph.running.checkpoints import Checkpoints
     from connrsfm_graph.tracks import check_reconstructable
 

@@ -31,10 +31,11 @@ def run(arguments: argparse.Namespace) -> None:
     from connrsfm_graph.cli.evaluate import evaluated
     from connrsfm_graph.errors import InputError
     from connrsfm_graph.progress import Progress
-    from connrsfm_graph.reconstruction import Reconstruction, RunRecord
+    from connrsfm_graph.reconstruction import Reconstruction
     from connrsfm_graph.report.page import write_report
     from connrsfm_graph.report.recording import write_recording
     from connrsfm_graph.report.renders import write_renders
+    from connrsfm_graph.run_record import RunRecord
     from connrsfm_graph.tracks import load_tracks
     from connrsfm_graph.tracks.images import images_of
 

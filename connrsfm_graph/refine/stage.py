@@ -10,8 +10,9 @@ import numpy as np
 
 from connrsfm_graph.errors import InputError
 from connrsfm_graph.refine.config import RefineConfig
-from connrsfm_graph.refine.fit import Fit, Task, fit
+from connrsfm_graph.refine.fit import fit
 from connrsfm_graph.refine.follow import Reference, contradicted
+from connrsfm_graph.refine.task import Fit, Task
 from connrsfm_graph.refine.uncertainty import log_depth_deviation
 from connrsfm_graph.refine.unseen import complete
 from connrsfm_graph.refine.wrong_tracks import wrong_tracks

@@ -17,13 +17,14 @@ import numpy as np
 from connrsfm_graph.dense.layout import DENSE_FOLDER
 from connrsfm_graph.files import folder_written_beside
 from connrsfm_graph.metrics import Evaluation
-from connrsfm_graph.reconstruction import Reconstruction, RunRecord
+from connrsfm_graph.reconstruction import Reconstruction
 from connrsfm_graph.report.charts import bar_chart, duration_chart, graph_chart, line_chart, range_chart
 from connrsfm_graph.report.photos import photos_of
 from connrsfm_graph.report.pictures import Painter
 from connrsfm_graph.report.shown import DenseSurfaces, paints
 from connrsfm_graph.report.surfaces import Surfaces
 from connrsfm_graph.report.viewer import viewer
+from connrsfm_graph.run_record import RunRecord
 
 REPORT_FILE = "report.html"
 PICTURES_FOLDER = "pictures"

@@ -10,7 +10,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from connrsfm_graph.others import Guide, Others, reconstruct_others
-from connrsfm_graph.reconstruction import peak_memory_mib
+from connrsfm_graph.run_record import peak_memory_mib
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ import factors
 from connrsfm_graph.config import as_dict
 from connrsfm_graph.errors import InputError
 from connrsfm_graph.files import check_output_folder, written_beside
-from connrsfm_graph.reconstruction import package_versions
+from connrsfm_graph.run_record import package_versions
 from connrsfm_graph.running.archive import Packed, packed, unpacked
 from connrsfm_graph.tracks import Tracks
 

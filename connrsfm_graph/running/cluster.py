@@ -10,7 +10,7 @@ from typing import Any
 
 from connrsfm_graph.errors import ComputationError, InputError
 from connrsfm_graph.others import Guide
-from connrsfm_graph.reconstruction import package_versions
+from connrsfm_graph.run_record import package_versions
 from connrsfm_graph.running.block import Block, Finished, work_on
 
 _SECONDS = 10

@@ -11,16 +11,10 @@ import numpy as np
 from numba import njit, prange
 
 from connrsfm_graph.problem import Problem, State
-from connrsfm_graph.solvers.batched import (
-    active_columns,
-    linearise_point,
-    pair_scratch,
-    point_equations,
-    row_precisions,
-    solve_point,
-)
+from connrsfm_graph.solvers.batched import active_columns, row_precisions
 from connrsfm_graph.solvers.block_cholesky import analyse
 from connrsfm_graph.solvers.interface import Minimum, PairModel
+from connrsfm_graph.solvers.one_point import linearise_point, pair_scratch, point_equations, solve_point
 from factors.noise import PairNoise
 
 

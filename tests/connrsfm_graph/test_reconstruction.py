@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from connrsfm_graph.errors import InputError
-from connrsfm_graph.reconstruction import Reconstruction, RunRecord, package_versions, peak_memory_mib
+from connrsfm_graph.reconstruction import Reconstruction
+from connrsfm_graph.run_record import RunRecord, package_versions, peak_memory_mib
 
 
 def small_reconstruction(names: bool = True) -> Reconstruction:
@@ -165,6 +166,6 @@ def test_bad_record_is_named(tmp_path: Path, text: str, message: str) -> None:
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems count the parent, too")
 def test_the_peak_memory_is_that_of_this_program_not_of_its_parent():
     ballast = np.ones(40_000_000)  # 305 MiB
-    code = "from connrsfm_graph.reconstruction import peak_memory_mib as peak; print(peak())"
+    code = "from connrsfm_graph.run_record import peak_memory_mib as peak; print(peak())"
     shown = float(subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout)
     assert 10 < shown < peak_memory_mib() - ballast.nbytes / 2**20

@@ -16,7 +16,8 @@ from connrsfm_graph.cli.main import main
 from connrsfm_graph.config import as_dict
 from connrsfm_graph.image_graph import GraphConfig, select_edges
 from connrsfm_graph.progress import Progress
-from connrsfm_graph.reconstruction import Reconstruction, RunRecord
+from connrsfm_graph.reconstruction import Reconstruction
+from connrsfm_graph.run_record import RunRecord
 from connrsfm_graph.tracks import Tracks
 
 

@@ -14,7 +14,8 @@ import cv2
 import numpy as np
 import pytest
 
-from connrsfm_graph.reconstruction import Reconstruction, RunRecord
+from connrsfm_graph.reconstruction import Reconstruction
+from connrsfm_graph.run_record import RunRecord
 from connrsfm_graph.synthetic.rendered import RenderConfig, render_sequence
 from connrsfm_graph.tracks import load_tracks
 from factors.surface import ORTHOGRAPHIC, PERSPECTIVE

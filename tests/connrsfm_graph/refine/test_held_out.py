@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from connrsfm_graph.refine import RefineConfig, refine
-from connrsfm_graph.refine.fit import Task
 from connrsfm_graph.refine.held_out import prediction_errors, predicts_better
 from connrsfm_graph.refine.noise import Noise
 from connrsfm_graph.refine.solve import Measurements, Shape, minimise
 from connrsfm_graph.refine.start import start_shape
+from connrsfm_graph.refine.task import Task
 from connrsfm_graph.refine.unseen import complete
 from connrsfm_graph.synthetic import isometric_bending, with_noise
 
@@ -79,7 +79,7 @@ def test_exact_data_are_beyond_doubt(monkeypatch: pytest.MonkeyPatch) -> None:
     def never(*arguments: object) -> np.ndarray:
         raise AssertionError("points were left out")
 
-    monkeypatch.setattr("connrsfm_graph.refine.fit.prediction_errors", never)
+    monkeypatch.setattr("connrsfm_graph.refine.settle.prediction_errors", never)
     scene = isometric_bending(n_frames=6, n_points=60, seed=1)
     image, seen = scene.tracks.normalised(), scene.tracks.visible
     found = refine(image, seen, scene.log_depth, RefineConfig(uncertainty=False), 1e-6)

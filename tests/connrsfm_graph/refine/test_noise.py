@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import pytest
 
-from connrsfm_graph.refine import RefineConfig, fit
+from connrsfm_graph.refine import RefineConfig, settle
+from connrsfm_graph.refine.fit import fit
+from connrsfm_graph.refine.noise import Noise
+from connrsfm_graph.refine.task import Fit, Task
 from connrsfm_graph.refine.unseen import complete
 from connrsfm_graph.synthetic import isometric_bending
 
@@ -21,17 +23,17 @@ def test_image_noise_is_lowered_only_while_the_lengths_stay(monkeypatch, moved):
     scene = isometric_bending(n_frames=6, n_points=60, seed=1)
     tracks = scene.tracks
     completed = complete(tracks.normalised(), tracks.visible, scene.log_depth)
-    task = fit.Task.of(completed, tracks.visible, RefineConfig(uncertainty=False))
-    assumed, refitted = [], fit._refitted
+    task = Task.of(completed, tracks.visible, RefineConfig(uncertainty=False))
+    assumed, refitted = [], settle._refitted
 
-    def moving(task: fit.Task, found: fit.Fit, noise: Any) -> fit.Fit:
+    def moving(task: Task, found: Fit, noise: Noise) -> Fit:
         assumed.append(noise.image)
         again = refitted(task, found, noise)
         shift = 2.0 * noise.length if moved else 0.0
         return replace(again, shape=replace(again.shape, log_length=again.shape.log_length + shift))
 
-    monkeypatch.setattr(fit, "_refitted", moving)
-    found = fit.fit(task, SIGMA)
+    monkeypatch.setattr(settle, "_refitted", moving)
+    found = fit(task, SIGMA)
     assert not found.noisy
     assert min(assumed) < 0.5 * SIGMA
     assert found.noise.image == (SIGMA if moved else min(assumed))

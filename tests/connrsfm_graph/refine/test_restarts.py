@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from connrsfm_graph.refine import RefineConfig
-from connrsfm_graph.refine.fit import Task
 from connrsfm_graph.refine.noise import Noise
 from connrsfm_graph.refine.restarts import restart
 from connrsfm_graph.refine.solve import Shape, fit_views, minimise
 from connrsfm_graph.refine.start import start_shape
+from connrsfm_graph.refine.task import Task
 from connrsfm_graph.refine.unseen import complete
 from connrsfm_graph.synthetic.jet import Jet
 from connrsfm_graph.synthetic.scene import Scene

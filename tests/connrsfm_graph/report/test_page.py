@@ -13,11 +13,12 @@ import pytest
 
 from connrsfm_graph.errors import InputError
 from connrsfm_graph.metrics import evaluate
-from connrsfm_graph.reconstruction import Reconstruction, RunRecord
+from connrsfm_graph.reconstruction import Reconstruction
 from connrsfm_graph.report.charts import bar_chart, duration_chart, graph_chart, line_chart, range_chart
 from connrsfm_graph.report.mesh import triangles
 from connrsfm_graph.report.page import MAX_FRAMES, write_report
 from connrsfm_graph.report.surfaces import Surfaces
+from connrsfm_graph.run_record import RunRecord
 
 RECORD = RunRecord(
     source="folder/<tracks>.npz",

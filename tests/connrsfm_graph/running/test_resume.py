@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from connrsfm_graph.reconstruction import RunRecord
+from connrsfm_graph.run_record import RunRecord
 from connrsfm_graph.tracks import save_tracks
 
 KILLS = 10

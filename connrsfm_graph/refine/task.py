@@ -1,0 +1,122 @@
+"""What the refinement is to fit, and a fit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from connrsfm_graph.refine.ambiguity import Ambiguity
+from connrsfm_graph.refine.config import RefineConfig
+from connrsfm_graph.refine.cost import Weights
+from connrsfm_graph.refine.mesh import Mesh
+from connrsfm_graph.refine.noise import Noise, neighbour_correlation
+from connrsfm_graph.refine.solve import Measurements, Shape, lag, linearise, minimise
+from connrsfm_graph.refine.start import start_mesh, start_shape
+from connrsfm_graph.refine.unseen import Completed
+
+_UNIT = 1e3
+"""Inverse standard deviation of the mean log length."""
+_DRIFT = 0.3
+"""Inverse standard deviation of log depths about their start."""
+_FACTOR = 0.1
+"""Inverse standard deviation of log conformal factors."""
+_DECLARED_FACTOR = 1e3
+"""The same for views declared isometric."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is to be fitted."""
+
+    completed: Completed
+    """Image points and log depths of all views, interpolated where not seen."""
+    seen: np.ndarray
+    """(F, P) bool."""
+    mesh: Mesh
+    """Neighbours."""
+    config: RefineConfig
+    """Settings."""
+
+    @staticmethod
+    def of(completed: Completed, seen: np.ndarray, config: RefineConfig) -> Task:
+        """With the mesh of the start."""
+        return Task(completed, seen, start_mesh(completed, seen, config.rings), config)
+
+    @property
+    def declared(self) -> np.ndarray:
+        """(F,) bool, views declared isometric to each other."""
+        return np.isin(np.arange(len(self.seen)), self.config.isometric_views)
+
+    def spacing(self) -> float:
+        """Median image length of the near edges."""
+        near = self.mesh.edges[: self.mesh.n_near]
+        image = self.completed.image
+        return float(np.median(np.linalg.norm(image[:, near[:, 0]] - image[:, near[:, 1]], axis=-1)))
+
+    def measurements(self, noise: Noise, conformal: bool, declared: bool = True) -> Measurements:
+        """Measurements under given noise levels, with or without what is known of views declared isometric."""
+        config, start = self.config, start_shape(self.completed, self.mesh)
+        return Measurements(
+            image=self.completed.image,
+            image_weight=noise.image_weight(self.seen, self.completed.deviation),
+            log_depth=start.log_depth,
+            log_length=start.log_length,
+            log_length_weight=np.full(len(start.log_length), 0.0 if conformal else noise.prior),
+            length_weight=np.full((len(self.seen), len(self.mesh.edges)), 1.0 / noise.length),
+            factor_weight=np.where(self.declared & declared, _DECLARED_FACTOR, _FACTOR),
+            mesh=self.mesh,
+            weights=Weights(
+                huber=noise.huber,
+                bending=1.0 / config.bending_sigma if config.bending else 0.0,
+                smoothness=1.0 / config.factor_sigma,
+                drift=_DRIFT,
+                unit=_UNIT,
+            ),
+        )
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A shape that fits the measurements, and how it was found."""
+
+    measurements: Measurements
+    shape: Shape
+    noise: Noise
+    history: list[float]
+    """Cost at the start and after every iteration, run after run."""
+    first_cost: float
+    """Cost of the best shape under the noise levels of the start."""
+    noisy: bool = True
+    """Whether the ray corrections look like noise."""
+    evidence: dict[str, Any] = field(default_factory=dict)
+    """What the choices rest on."""
+    ambiguity: Ambiguity | None = None
+    """Which views may be inverted; None in an isometric model."""
+    alternative: Shape | None = None
+    """The shape with all ambiguous views inverted."""
+
+    @property
+    def conformal(self) -> bool:
+        return self.shape.log_factor.size > 0
+
+    def residuals(self) -> np.ndarray:
+        """(F, E) length residuals."""
+        envelope = self.measurements.envelope(self.conformal)
+        return linearise(self.measurements, self.shape, lag(self.measurements, self.shape), envelope)[1]
+
+    def misfit(self) -> float:
+        """Squared residuals of an isometric fit in assumed variances, on average over its degrees of freedom."""
+        (F, P), E = self.shape.log_depth.shape, len(self.shape.log_length)
+        return 2.0 * self.first_cost / max(F * E - F * P - E, 1)
+
+    def looks_like_noise(self, task: Task) -> bool:
+        """Whether neighbours' ray corrections are independent."""
+        correlation, error = neighbour_correlation(self.shape.correction, task.seen, task.mesh)
+        return correlation <= error
+
+
+def minimised(task: Task, measurements: Measurements, shape: Shape) -> tuple[Shape, list[float]]:
+    """The minimum from a shape, and the costs on the way."""
+    return minimise(measurements, shape, task.config.iterations, task.config.tolerance)
