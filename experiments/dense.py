@@ -62,7 +62,7 @@ def measure(options: Options) -> None:
     try:
         import torch
     except ModuleNotFoundError:
-        print("dense: skipped, torch is not installed (pip install 'connrsfm-graph[dense]')")
+        print("dense: skipped, torch is not installed (pip install '.[dense]')")
         return
     from connrsfm_graph.dense.checkpoint import SHIPPED, Checkpoint
 

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from connrsfm_graph.errors import InputError
+from connrsfm_graph.errors import InputError, missing_package
 
 if TYPE_CHECKING:
     from connrsfm_graph.progress import Progress
@@ -33,9 +33,7 @@ def _imported(name: str) -> Method:
         try:
             module = import_module(f"connrsfm_graph.baselines.{name}")
         except ModuleNotFoundError as error:
-            raise InputError(
-                f"the baseline '{name}' needs the package {error.name}: pip install 'connrsfm-graph[baselines]'"
-            ) from error
+            raise missing_package(f"the baseline '{name}'", str(error.name), "baselines") from error
         return module.reconstruct(tracks, config, progress)
 
     return run

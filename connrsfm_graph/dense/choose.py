@@ -12,7 +12,7 @@ import numpy as np
 
 from connrsfm_graph.dense.sparse import SparsePoints
 from connrsfm_graph.dense.spline_depth import SplineDepth
-from connrsfm_graph.errors import InputError
+from connrsfm_graph.errors import InputError, missing_package
 
 METHODS = ("network", "spline")
 
@@ -84,4 +84,4 @@ def choose(images: Sequence[SparsePoints], wanted: str | None = None, checkpoint
 def require_torch() -> None:
     """Raise `InputError` where torch is not installed."""
     if find_spec("torch") is None:
-        raise InputError("the network needs torch, which is not installed: pip install 'connrsfm-graph[dense]'")
+        raise missing_package("the network", "torch", "dense")

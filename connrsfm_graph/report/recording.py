@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from connrsfm_graph.errors import InputError
+from connrsfm_graph.errors import InputError, missing_package
 from connrsfm_graph.files import written_beside
 from connrsfm_graph.reconstruction import Reconstruction
 from connrsfm_graph.report.colour import point_colours, ramp_colours
@@ -53,7 +53,7 @@ def write_recording(
     try:
         import rerun as rr
     except ImportError as error:
-        raise InputError("--rerun: rerun is not installed, install the extra 'viz'") from error
+        raise missing_package("--rerun", "rerun", "viz") from error
     surfaces = Surfaces.of(reconstruction, truth)
     dense = DenseSurfaces.beside(Path(out))
     if images is None and dense is not None:

@@ -8,7 +8,7 @@ from itertools import islice
 from threading import Lock
 from typing import Any
 
-from connrsfm_graph.errors import ComputationError, InputError
+from connrsfm_graph.errors import ComputationError, InputError, missing_package
 from connrsfm_graph.others import Guide
 from connrsfm_graph.run_record import package_versions
 from connrsfm_graph.running.block import Block, Finished, work_on
@@ -32,9 +32,7 @@ class Cluster:
         try:
             from distributed import Client
         except ImportError as error:
-            raise InputError(
-                "running on a cluster needs dask.distributed, which is not installed; install the extra 'cluster'"
-            ) from error
+            raise missing_package("running on a cluster", "dask.distributed", "cluster") from error
         try:
             self._client = Client(address, timeout=_SECONDS, set_as_default=False)
         except (OSError, TimeoutError, ValueError) as error:

@@ -105,4 +105,4 @@ def test_train_depth_without_torch_names_the_extra(
     monkeypatch.setattr(choose, "find_spec", lambda name: None)
     ended = connrsfm("train-depth", "--out", tmp_path / "a.pt")
     assert ended.status == 2
-    assert "pip install 'connrsfm-graph[dense]'" in ended.err
+    assert "pip install '.[dense]'" in ended.err

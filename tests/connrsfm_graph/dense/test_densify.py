@@ -148,5 +148,5 @@ def test_without_torch_the_spline_is_chosen_and_the_network_refused(
     monkeypatch.setattr(choosing, "find_spec", lambda name: None)
     index = densify(sheet(), images, tmp_path)
     assert (index.method, index.reason) == ("spline", "the network needs torch, which is not installed")
-    with pytest.raises(InputError, match=r"pip install 'connrsfm-graph\[dense\]'"):
+    with pytest.raises(InputError, match=r"pip install '\.\[dense\]'"):
         densify(sheet(), images, tmp_path, "network")
