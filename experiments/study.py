@@ -22,6 +22,7 @@ from typing import Any
 import numba
 
 from connrsfm_graph.cli.evaluate import evaluated
+from connrsfm_graph.config import override
 from connrsfm_graph.errors import ComputationError, InputError
 from connrsfm_graph.methods import METHODS
 from connrsfm_graph.progress import Progress
@@ -139,11 +140,11 @@ class Group:
 
 @cache
 def compile_kernels() -> None:
-    """Run both modes once on a small scene, so that no compilation is timed."""
-    tracks = spheres(n_frames=4, n_points=30).tracks
+    """Run both modes once on a small scene, with an image that follows keyframes, so that no compilation is timed."""
+    tracks = spheres(n_frames=6, n_points=30).tracks
     for name in ("default", "paper mode"):
         method, config = VARIANTS[name]
-        METHODS[method](tracks, config, Progress())
+        METHODS[method](tracks, override(config, ["keyframes.most=5"]), Progress())  # the last image follows them
 
 
 def run(case: Case) -> dict[str, str]:
