@@ -8,6 +8,7 @@ import numpy as np
 
 from connrsfm_graph.refine.ambiguity import resolve
 from connrsfm_graph.refine.noise import Noise
+from connrsfm_graph.refine.reseat import reseat
 from connrsfm_graph.refine.restarts import inverted, restart
 from connrsfm_graph.refine.settle import BEYOND_DOUBT, settled
 from connrsfm_graph.refine.solve import Measurements, Shape, costs, lag
@@ -62,7 +63,7 @@ def fit_isometric(task: Task, noise: Noise) -> Fit:
         again = _from_start(flat, noise, _PROMISING * found.first_cost)
         if again.first_cost < found.first_cost:
             task, found = flat, again
-    return settled(task, found)
+    return settled(task, _reseated(task, found))
 
 
 def _from_start(task: Task, noise: Noise, worth: float = np.inf) -> Fit:
@@ -70,10 +71,8 @@ def _from_start(task: Task, noise: Noise, worth: float = np.inf) -> Fit:
     gains."""
     measurements = task.measurements(noise, conformal=False)
     shape, history = minimised(task, measurements, start_shape(task.completed, task.mesh))
-    factor, per_edge = _SUSPECT
     for _ in range(_RESTARTS if history[-1] < worth else 0):
-        cost = costs(measurements, shape, lag(measurements, shape))
-        suspect = np.flatnonzero(cost > max(factor * np.quantile(cost, 0.25), per_edge * len(task.mesh.edges)))
+        suspect = _suspect(measurements, shape)
         if len(suspect) == 0:
             break
         better, renewed = restart(measurements.views(suspect), shape.views(suspect))
@@ -82,6 +81,29 @@ def _from_start(task: Task, noise: Noise, worth: float = np.inf) -> Fit:
         shape, more = minimised(task, measurements, shape.replaced(suspect, better))
         history += more
     return Fit(measurements, shape, noise, history, history[-1])
+
+
+def _suspect(measurements: Measurements, shape: Shape) -> np.ndarray:
+    """Numbers of the views that cost more than others."""
+    factor, per_edge = _SUSPECT
+    cost = costs(measurements, shape, lag(measurements, shape))
+    return np.flatnonzero(cost > max(factor * np.quantile(cost, 0.25), per_edge * len(measurements.mesh.edges)))
+
+
+def _reseated(task: Task, found: Fit) -> Fit:
+    """The fit with single points elsewhere in views that still cost more than others, as long as that pays."""
+    for _ in range(_RESTARTS):
+        suspect = _suspect(found.measurements, found.shape)
+        if len(suspect) == 0:
+            break
+        better, renewed = reseat(found.measurements.views(suspect), found.shape.views(suspect))
+        if not renewed.any():
+            break
+        shape, more = minimised(task, found.measurements, found.shape.replaced(suspect, better))
+        if not more[-1] < found.first_cost:
+            break
+        found = replace(found, shape=shape, history=found.history + more, first_cost=more[-1])
+    return found
 
 
 def fit_conformal(task: Task, noise: Noise) -> Fit:

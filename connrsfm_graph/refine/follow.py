@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from connrsfm_graph.refine.config import RefineConfig
+from connrsfm_graph.refine.reseat import reseat
 from connrsfm_graph.refine.resection import moved_rigidly
 from connrsfm_graph.refine.restarts import inverted, restart
 from connrsfm_graph.refine.solve import Measurements, Shape, costs, fit_views, lag
@@ -155,5 +156,7 @@ def _fitted(
     caught = np.flatnonzero(cost > max(factor * reference.typical_cost(), per_edge * E))
     if len(caught):
         better, _ = restart(measurements.views(caught), shape.views(caught))
+        if not better.log_factor.size:
+            better, _ = reseat(measurements.views(caught), better)
         shape = shape.replaced(caught, better)
     return measurements, shape

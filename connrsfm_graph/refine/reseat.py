@@ -11,12 +11,25 @@ from dataclasses import replace
 import numpy as np
 from scipy import sparse
 
-from connrsfm_graph.refine.solve import Measurements, Shape, lag
+from connrsfm_graph.refine.solve import Measurements, Shape, costs, fit_views, lag
 
 _STEPS = np.linspace(-0.3, 0.3, 61)
 """Changes of log depth that are tried."""
 _BETTER = 0.8
 """A new place must lower the cost of the point's lengths to this part; the fit from there decides."""
+_WORTH = 0.9
+"""That fit must lower the view's cost to this part."""
+_ITERATIONS = 25
+_TOLERANCE = 0.02
+"""It ends where an iteration gains less than this part."""
+
+
+def reseat(measurements: Measurements, shape: Shape) -> tuple[Shape, np.ndarray]:
+    """The isometric shape with single points of a view elsewhere where that pays, lengths held, and (F,) in which
+    views it did."""
+    trial, cost = fit_views(measurements, reseated(measurements, shape), _ITERATIONS, _TOLERANCE)
+    better = cost < _WORTH * costs(measurements, shape, lag(measurements, shape))
+    return shape.replaced(np.flatnonzero(better), trial.views(better)), better
 
 
 def reseated(measurements: Measurements, shape: Shape) -> Shape:

@@ -5,8 +5,7 @@ With the lengths held, every view is fitted from a number of simple surfaces and
 for a few iterations, only the most promising ones to the end.
 
 Seen from afar, a bent sheet may be wrong in a part: of two bends each can be taken for its mirror image in depth.
-So isometric views are also tried with the part on one side of a line reflected about it, and with single points
-moved (`reseat`).
+So isometric views are also tried with the part on one side of a line reflected about it.
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from connrsfm_graph.refine.reseat import reseated
 from connrsfm_graph.refine.solve import Measurements, Shape, costs, fit_views, lag
 from connrsfm_graph.refine.start import log_chords
 
@@ -86,8 +84,8 @@ def restart(measurements: Measurements, shape: Shape) -> tuple[Shape, np.ndarray
 
 
 def _starts(measurements: Measurements, shape: Shape) -> Iterator[Shape]:
-    """The shape's tangent planes, its mirror images in depth, as a whole and in part, or its inversion, the shape with
-    single points elsewhere on their rays, and planes tilted in all directions."""
+    """The shape's tangent planes, its mirror images in depth, as a whole and in part, or its inversion, and planes
+    tilted in all directions."""
     F, P = shape.log_depth.shape
     ray = measurements.image + shape.correction
     centred = ray - ray.mean(axis=1, keepdims=True)
@@ -101,7 +99,6 @@ def _starts(measurements: Measurements, shape: Shape) -> Iterator[Shape]:
     if shape.log_factor.size:
         yield inverted(shape, measurements.image, np.ones(F, dtype=bool))
     else:
-        yield reseated(measurements, shape)
         yield from _folded(shape, centred)
     flat = np.zeros_like(shape.log_factor)
     for angle in np.arange(_TILTS) * (2.0 * np.pi / _TILTS):
