@@ -26,20 +26,18 @@ def data_set_1(options: Options) -> Callable[..., Scene]:
     return partial(spheres, n_frames=4, n_points=40) if options.quick else spheres
 
 
-def _spheres(options: Options) -> Iterable[Case]:
-    scene = data_set_1(options)
+def _all_methods(scene: Callable[..., Scene], options: Options) -> Iterable[Case]:
     for seed in options.seeds():
         for name, (method, config) in VARIANTS.items():
             yield Case({"method": name, "seed": seed}, partial(tracks_of, scene, seed), method, config)
 
 
+def _spheres(options: Options) -> Iterable[Case]:
+    return _all_methods(data_set_1(options), options)
+
+
 def _mixed(options: Options) -> Iterable[Case]:
-    """The cone programmes grow too large for 600 points in the time of the others; `mlh` is left out."""
-    scene = partial(mixed, n_frames=4, n_points=40) if options.quick else mixed
-    for seed in options.seeds():
-        for name, (method, config) in VARIANTS.items():
-            if name != "mlh":
-                yield Case({"method": name, "seed": seed}, partial(tracks_of, scene, seed), method, config)
+    return _all_methods(partial(mixed, n_frames=4, n_points=40) if options.quick else mixed, options)
 
 
 SPHERES = Experiment(

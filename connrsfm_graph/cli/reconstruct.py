@@ -148,7 +148,8 @@ def reconstruct_into(
         from connrsfm_graph.cli.evaluate import evaluated, summary
 
         try:
-            evaluation, truth = evaluated(reconstruction, tracks, source)
+            with progress.stage("evaluation"):  # of thousands of images it takes as long as the run
+                evaluation, truth = evaluated(reconstruction, tracks, source)
             print(summary(evaluation))
         except InputError as error:  # the result stands, whatever is wrong with the truth
             print(f"warning: not evaluated: {error}", file=sys.stderr)
