@@ -10,7 +10,7 @@ from connrsfm_graph.refine.ambiguity import resolve
 from connrsfm_graph.refine.noise import Noise
 from connrsfm_graph.refine.reseat import reseat
 from connrsfm_graph.refine.restarts import inverted, restart
-from connrsfm_graph.refine.settle import BEYOND_DOUBT, settled
+from connrsfm_graph.refine.settle import BEYOND_DOUBT, noise_evidence, settled
 from connrsfm_graph.refine.solve import Measurements, Shape, costs, lag
 from connrsfm_graph.refine.start import start_shape
 from connrsfm_graph.refine.task import Fit, Task, minimised
@@ -54,7 +54,11 @@ def fit(task: Task, sigma_image: float) -> Fit:
 
 
 def fit_isometric(task: Task, noise: Noise) -> Fit:
-    """Isometric fit from the start and, where that leaves a doubt, from flat views; the cheaper one stays."""
+    """Isometric fit from the start and, where that leaves a doubt, from flat views; the cheaper one stays.
+
+    Where even that one misses isometry, views that cost more than others start from what those have found. Views that
+    are caught may show only when the noise levels are known, so they are looked for once more in the end.
+    """
     found = _from_start(task, noise)
     misfit = found.misfit()
     if misfit > _MISFIT or (misfit > BEYOND_DOUBT and not found.looks_like_noise(task)):
@@ -63,24 +67,37 @@ def fit_isometric(task: Task, noise: Noise) -> Fit:
         again = _from_start(flat, noise, _PROMISING * found.first_cost)
         if again.first_cost < found.first_cost:
             task, found = flat, again
-    return settled(task, _reseated(task, found))
+    if found.misfit() > _MISFIT:
+        found = _restarted_where_dear(task, found, lend=True)
+    found = settled(task, _reseated(task, found))
+    found = replace(_restarted_where_dear(task, found), first_cost=found.first_cost)
+    found.evidence.update(noise_evidence(task, found))
+    return found
 
 
 def _from_start(task: Task, noise: Noise, worth: float = np.inf) -> Fit:
-    """Isometric fit; where it costs less than `worth`, views that cost more than others try other starts until none
-    gains."""
+    """Isometric fit; where it costs less than `worth`, views that cost more than others are restarted."""
     measurements = task.measurements(noise, conformal=False)
     shape, history = minimised(task, measurements, start_shape(task.completed, task.mesh))
-    for _ in range(_RESTARTS if history[-1] < worth else 0):
-        suspect = _suspect(measurements, shape)
+    found = Fit(measurements, shape, noise, history, history[-1])
+    return _restarted_where_dear(task, found) if history[-1] < worth else found
+
+
+def _restarted_where_dear(task: Task, found: Fit, lend: bool = False) -> Fit:
+    """The fit with views that cost more than others restarted until none gains; `lend` says whether also from the
+    surfaces of those others."""
+    measurements = found.measurements
+    for _ in range(_RESTARTS):
+        suspect = _suspect(measurements, found.shape)
         if len(suspect) == 0:
             break
-        better, renewed = restart(measurements.views(suspect), shape.views(suspect))
+        others = np.delete(found.shape.points(measurements.image), suspect, axis=0) if lend else None
+        better, renewed = restart(measurements.views(suspect), found.shape.views(suspect), others)
         if not renewed.any():
             break
-        shape, more = minimised(task, measurements, shape.replaced(suspect, better))
-        history += more
-    return Fit(measurements, shape, noise, history, history[-1])
+        shape, more = minimised(task, measurements, found.shape.replaced(suspect, better))
+        found = replace(found, shape=shape, history=found.history + more, first_cost=more[-1])
+    return found
 
 
 def _suspect(measurements: Measurements, shape: Shape) -> np.ndarray:

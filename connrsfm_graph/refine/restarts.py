@@ -2,7 +2,8 @@
 
 Once most views are right, so are the lengths; a view that is caught elsewhere then costs visibly more than it need.
 With the lengths held, every view is fitted from a number of simple surfaces and keeps the cheapest. All are fitted
-for a few iterations, only the most promising ones to the end.
+for a few iterations, only the most promising ones to the end. What other views have found to be the surface is
+another start, moved rigidly to where it is seen.
 
 Seen from afar, a bent sheet may be wrong in a part: of two bends each can be taken for its mirror image in depth.
 So isometric views are also tried with the part on one side of a line reflected about it.
@@ -11,9 +12,12 @@ So isometric views are also tried with the part on one side of a line reflected 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 
+from connrsfm_graph.refine.resection import moved_rigidly
 from connrsfm_graph.refine.solve import Measurements, Shape, costs, fit_views, lag
 from connrsfm_graph.refine.start import log_chords
 
@@ -32,6 +36,8 @@ _SCREENING = 1
 _TRIED = (12, 4.0)
 """So many of the cheapest starts are then followed to the end, where they cost at most this many times the shape.
 With conformal factors, which are slow to come, all are."""
+_LENT = 6
+"""Surfaces of other views that a view starts from, those that project best to its image points."""
 _STEEP = 0.15
 """Change of log depth over the spread of the image points in a tilted start."""
 
@@ -57,20 +63,26 @@ def inverted(shape: Shape, image: np.ndarray, views: np.ndarray) -> Shape:
     )
 
 
-def restart(measurements: Measurements, shape: Shape) -> tuple[Shape, np.ndarray]:
-    """The shape with every view's cheapest surface, lengths held, and (F,) which views have a new one."""
+def restart(measurements: Measurements, shape: Shape, others: np.ndarray | None = None) -> tuple[Shape, np.ndarray]:
+    """The shape with every view's cheapest surface, lengths held, and (F,) which views have a new one.
+
+    Args:
+        measurements, shape: the views.
+        others: (K, P, 3) surfaces of other views, in front of their cameras, to start from as well.
+    """
     least = costs(measurements, shape, lag(measurements, shape))
+    lent = [] if others is None else list(_lent(measurements, shape, others))
     first = np.stack(
         [
             fit_views(measurements, _scaled(measurements, start), _SCREENING, 0.0)[1]
-            for start in _starts(measurements, shape)
+            for start in chain(_starts(measurements, shape), lent)
         ]
     )
     number, factor = _TRIED
     tried = (np.argsort(np.argsort(first, axis=0), axis=0) < number) & (first <= factor * least)
     tried |= shape.log_factor.size > 0
     best, renewed = shape, np.zeros(len(least), dtype=bool)
-    for start, chosen in zip(_starts(measurements, shape), tried, strict=True):
+    for start, chosen in zip(chain(_starts(measurements, shape), lent), tried, strict=True):
         if not chosen.any():
             continue
         views = np.flatnonzero(chosen)
@@ -104,6 +116,17 @@ def _starts(measurements: Measurements, shape: Shape) -> Iterator[Shape]:
     for angle in np.arange(_TILTS) * (2.0 * np.pi / _TILTS):
         tilt = _STEEP * (centred @ np.array([np.cos(angle), np.sin(angle)])) / spread
         yield Shape(mean + tilt, shape.correction, flat, shape.log_length)
+
+
+def _lent(measurements: Measurements, shape: Shape, others: np.ndarray) -> Iterator[Shape]:
+    """Surfaces of other views (K, P, 3), moved rigidly to the image points; best projections first."""
+    image = measurements.image
+    F, P, _ = image.shape
+    every = np.ones((F, P), dtype=bool)
+    moved = np.stack([moved_rigidly(np.repeat(surface[None], F, axis=0), image, every) for surface in others])
+    error = ((moved[..., :2] / moved[..., 2:] - image) ** 2).sum(axis=(2, 3))
+    for number in np.argsort(error, axis=0, kind="stable")[:_LENT]:
+        yield replace(shape, log_depth=np.log(moved[number, np.arange(F), :, 2]))
 
 
 def _folded(shape: Shape, ray: np.ndarray) -> Iterator[Shape]:

@@ -41,7 +41,7 @@ def settled(task: Task, found: Fit) -> Fit:
         if noise.image < found.noise.image and moved > noise.length and not freed:
             break
         found = again
-    found.evidence.update(_noise_evidence(task, found))
+    found.evidence.update(noise_evidence(task, found))
     return replace(found, noisy=noisy)
 
 
@@ -65,7 +65,8 @@ def _refitted(task: Task, found: Fit, noise: Noise) -> Fit:
     return replace(found, measurements=measurements, shape=shape, noise=noise, history=found.history + history)
 
 
-def _noise_evidence(task: Task, found: Fit) -> dict[str, Any]:
+def noise_evidence(task: Task, found: Fit) -> dict[str, Any]:
+    """What a fit says about the noise."""
     noise, correction = found.noise, found.shape.correction
     return {
         "image noise": noise.image,
