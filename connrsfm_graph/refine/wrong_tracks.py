@@ -93,7 +93,9 @@ def disagreement(
     ):
         near[g] = found
     score = np.zeros((F, P))
-    over_views(_judge, F, image, visible, trusted, sources, source_trusted, chosen, near, share, score)
+    # Arrays picked by columns may be stored by columns, for which everything would be compiled once more.
+    arrays = (np.ascontiguousarray(array) for array in (image, visible, trusted, sources, source_trusted))
+    over_views(_judge, F, *arrays, chosen, near, share, score)
     return score
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from connrsfm_graph.refine.wrong_tracks import wrong_tracks
+from connrsfm_graph.refine.wrong_tracks import _judge, wrong_tracks
 from connrsfm_graph.synthetic import isometric_bending, moebius, with_missing, with_noise, with_outliers
 
 
@@ -42,3 +42,14 @@ def test_a_track_wrong_in_half_of_its_views_is_right_in_the_others(point):
     wrong[:3, point] = True
     image[wrong] += 0.1 * np.array([[1.0, 0.3], [-0.5, 0.8], [0.2, -1.0]])
     np.testing.assert_array_equal(wrong_tracks(image, tracks.visible), wrong)
+
+
+def test_how_arrays_are_stored_is_no_matter():
+    """Nothing is compiled once more for arrays stored by columns, and the result is the same."""
+    tracks, _ = with_outliers(with_noise(isometric_bending().tracks, 0.5), 0.1)
+    image, visible = tracks.normalised(), tracks.visible
+    by_rows = wrong_tracks(image, visible, (image, visible))
+    compiled = len(_judge.signatures)
+    by_columns = np.asfortranarray(image), np.asfortranarray(visible)
+    np.testing.assert_array_equal(wrong_tracks(*by_columns, by_columns), by_rows)
+    assert len(_judge.signatures) == compiled
