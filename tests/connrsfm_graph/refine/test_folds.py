@@ -70,7 +70,7 @@ def test_a_view_starts_from_what_others_have_found() -> None:
 
 @pytest.mark.slow
 def test_a_folded_sheet_is_isometric() -> None:
-    """Views on their own find other surfaces, to which only the conformal model bends; its error is above 4 %."""
+    """And to less than 1 %, which views restarted from simple surfaces only do not reach."""
     points = folded(12, 120, seed=0)
     seen = np.ones(points.shape[:2], dtype=bool)
     found = refine(noisy_image(points, 0), seen, np.zeros(seen.shape), RefineConfig(uncertainty=False), SIGMA)
