@@ -46,16 +46,16 @@ def settled(task: Task, found: Fit) -> Fit:
 
 
 def _trusting_lengths(task: Task, found: Fit) -> Fit:
-    """The fit with half the length noise, or a quarter, as long as points left out are predicted better."""
+    """The fit with half the length noise, or a quarter, where points left out are predicted better."""
     if found.misfit() < BEYOND_DOUBT:
         return found
     errors = prediction_errors(found.measurements, found.shape, task.seen)
+    trial = found
     for _ in range(_HALVINGS):
-        trial = _refitted(task, found, found.noise.halved_length())
+        trial = _refitted(task, trial, trial.noise.halved_length())
         new = prediction_errors(trial.measurements, trial.shape, task.seen)
-        if not predicts_better(new, errors):
-            break
-        found, errors = trial, new
+        if predicts_better(new, errors):
+            found, errors = trial, new
     return found
 
 

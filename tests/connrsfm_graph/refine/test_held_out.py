@@ -73,6 +73,29 @@ def test_chance_is_not_better() -> None:
     assert not predicts_better(errors[:1] - 1, errors[:1])
 
 
+@pytest.mark.parametrize(
+    ("gains", "taken"),
+    [((0.0, 0.0), 0.01), ((0.2, 0.2), 0.005), ((0.2, 0.4), 0.0025), ((0.0, 0.2), 0.0025), ((-0.2, 0.0), 0.01)],
+)
+def test_the_length_noise_that_predicts_best_is_taken(
+    monkeypatch: pytest.MonkeyPatch, gains: tuple[float, float], taken: float
+) -> None:
+    """What the first halving does not show the second may."""
+    scene = isometric_bending(n_frames=6, n_points=60, seed=1)
+    tracks = with_noise(scene.tracks, PIXELS, seed=1)
+    errors = np.random.default_rng(0).chisquare(2, 500)
+    part = dict(zip((0.01, 0.005, 0.0025), (0.0, *gains), strict=True))
+
+    def canned(measurements: Measurements, *arguments: object) -> np.ndarray:
+        return np.asarray((1.0 - part[round(1.0 / measurements.length_weight[0, 0], 6)]) * errors)
+
+    monkeypatch.setattr("connrsfm_graph.refine.settle.prediction_errors", canned)
+    sigma = PIXELS / tracks.focal_length()
+    settings = RefineConfig(uncertainty=False)
+    found = refine(tracks.normalised(), tracks.visible, scene.log_depth, settings, sigma)
+    assert found.evidence["length noise"] == taken
+
+
 def test_exact_data_are_beyond_doubt(monkeypatch: pytest.MonkeyPatch) -> None:
     """They leave nothing that points left out could tell."""
 
