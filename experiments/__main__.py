@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from experiments import accuracy, cloth, dense, slam, theorem
+from experiments import accuracy, cloth, dense, slam, theorem, truth
 from experiments.ablations import ABLATION, EDGES, ITERATIONS, ROW_SIGMAS, STARTING_VALUES
 from experiments.missing import MISSING
 from experiments.publish import publish
@@ -57,6 +57,7 @@ EXPERIMENTS: dict[str, Callable[[Options], None]] = {
     "theorem": verify_theorem,
     **{experiment.name: experiment for experiment in TABLES},
     "cloth": cloth.measure,
+    "truth": truth.measure,
     "dense": dense.measure,
     "accuracy": accuracy.measure,
     "slam": fuse_with_poses,

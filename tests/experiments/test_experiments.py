@@ -51,7 +51,7 @@ def test_the_command_line_knows_every_experiment(capsys: pytest.CaptureFixture[s
     with pytest.raises(SystemExit) as stop:
         main(["no_such_experiment"])
     assert stop.value.code == 2
-    others = {"theorem", "cloth", "dense", "accuracy", "slam", "summary"}
+    others = {"theorem", "cloth", "truth", "dense", "accuracy", "slam", "summary"}
     assert {experiment.name for experiment in TABLES} | others == set(EXPERIMENTS)
 
 
@@ -69,5 +69,5 @@ def test_the_quick_set_runs_without_any_data(tmp_path: Path) -> None:
     assert main(["quick", "--data", str(tmp_path / "nothing"), "--out", str(tmp_path)]) == 0
     written = {path.stem for path in (tmp_path / "quick").glob("*.md")}
     training = {"dense_compact_0", "dense_compact_0.25"}
-    assert written == set(EXPERIMENTS) - {"tshirt", "flag", "kinect_paper", "cloth"} | training
+    assert written == set(EXPERIMENTS) - {"tshirt", "flag", "kinect_paper", "cloth", "truth"} | training
     assert "| Synthetic 1 | **" in (tmp_path / "quick" / "summary.md").read_text()
