@@ -134,7 +134,7 @@ def markdown(rows: Sequence[Row]) -> str:
 
 
 def measure(options: Options) -> None:
-    """Write truth.csv and truth.md; data sets that are absent are left out, and of a quick run all but one method."""
+    """Write truth.csv and truth.md, of the data sets that are there; a quick run holds the default alone."""
     paths = {name: options.data / file for name, file in SETS.items()}
     there = {name: path for name, path in paths.items() if path.is_file()}
     if not there:

@@ -22,8 +22,8 @@ _HALVINGS = 2
 def settled(task: Task, found: Fit) -> Fit:
     """The fit with the noise levels that the data show.
 
-    Where the ray corrections look like noise, the image noise stands and the lengths are trusted more, as long as that
-    predicts image points better. Where they do not, the image noise was assumed too large, as long as that leaves the
+    Where the ray corrections look like noise, the image noise stands and the lengths are trusted more, if that predicts
+    image points better. Where they do not, the image noise was assumed too large, as long as that leaves the
     shared lengths where they are: what little noise is left would else crumple all views alike.
     """
     noisy = found.looks_like_noise(task)
