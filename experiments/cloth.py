@@ -8,11 +8,10 @@ method scores that knows everything but the shape.
 
 from __future__ import annotations
 
-import csv
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -21,7 +20,7 @@ from connrsfm_graph.metrics.alignment import align_similarity
 from connrsfm_graph.progress import Progress
 from connrsfm_graph.tracks import Tracks, check_reconstructable
 from experiments.loaders.cloth_r1 import load_cloth
-from experiments.study import VARIANTS, Options
+from experiments.study import VARIANTS, Options, save
 
 SHOWN = ("default", "paper mode")
 FOLDER = "cloth_r1"
@@ -110,10 +109,7 @@ def measure(options: Options) -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     tracks = load_cloth(folder)
     rows = [row for name in SHOWN for row in compare(tracks, name)]
-    with (options.out / "cloth.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, fieldnames=[field.name for field in fields(Row)])
-        writer.writeheader()
-        writer.writerows(asdict(row) for row in rows)
+    save(options.out / "cloth.csv", rows)
     text = markdown(rows)
     (options.out / "cloth.md").write_text(text, encoding="utf-8")
     print(text)

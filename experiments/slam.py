@@ -26,10 +26,9 @@ prints both tables and writes slam.csv, slam_real.csv and slam.md.
 from __future__ import annotations
 
 import argparse
-import csv
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -57,6 +56,7 @@ from connrsfm_graph.slam.trajectory import chained
 from connrsfm_graph.synthetic.passing_camera import PassingScene, noisy_odometry, passing_camera, relative_depth
 from connrsfm_graph.synthetic.scene import INTRINSICS
 from connrsfm_graph.tracks import Tracks
+from experiments.study import save
 
 IMAGE_SIGMA = 1e-3
 """Half a pixel of the virtual camera."""
@@ -216,14 +216,6 @@ def table(rows: Sequence[Row]) -> str:
         figures = (row.ate, row.rpe_translation, row.rpe_rotation_deg, row.surface, row.seconds)
         lines.append(f"{row.method:<26}" + "".join(f"{'-' if np.isnan(x) else f'{x:.4g}':>10}" for x in figures))
     return "\n".join(lines)
-
-
-def save(path: Path, rows: Sequence[Row]) -> None:
-    """The comparison as CSV."""
-    with written_beside(path) as part, part.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, [item.name for item in fields(Row)])
-        writer.writeheader()
-        writer.writerows(asdict(row) for row in rows)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

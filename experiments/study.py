@@ -14,7 +14,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ import numba
 from connrsfm_graph.cli.evaluate import evaluated
 from connrsfm_graph.config import override
 from connrsfm_graph.errors import ComputationError, InputError
+from connrsfm_graph.files import written_beside
 from connrsfm_graph.methods import METHODS
 from connrsfm_graph.progress import Progress
 from connrsfm_graph.reconstruct import Config, default_config
@@ -179,6 +180,14 @@ def append_row(path: Path, row: Mapping[str, str]) -> None:
         if new:
             writer.writeheader()
         writer.writerow(row)
+
+
+def save(path: Path, rows: Sequence[Any]) -> None:
+    """A table of dataclass instances of one kind, at least one, as CSV."""
+    with written_beside(path) as part, part.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, [column.name for column in fields(rows[0])])
+        writer.writeheader()
+        writer.writerows(asdict(row) for row in rows)
 
 
 def group(rows: Sequence[Mapping[str, str]], columns: Sequence[str]) -> list[Group]:

@@ -13,10 +13,9 @@ error of some methods, both as the truth is given and so corrected. Where the tr
 
 from __future__ import annotations
 
-import csv
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +26,8 @@ from connrsfm_graph.metrics import evaluate
 from connrsfm_graph.progress import Progress
 from connrsfm_graph.refine.mesh import surface_mesh
 from connrsfm_graph.tracks import load_tracks
-from experiments.study import VARIANTS, Options
+from experiments.cloth import truth_of
+from experiments.study import VARIANTS, Options, save
 
 SETS = {"T-shirt": "tshirt.npz", "KinectPaper": "kinect_paper.npz", "Flag": "flag.npz"}
 SHOWN = ("default", "paper mode", "mlh", "mdh")
@@ -91,9 +91,9 @@ def cross_corrected(points: np.ndarray, edges: np.ndarray) -> np.ndarray:
 def compare(data: str, path: Path, methods: Sequence[str] = SHOWN) -> list[Row]:
     """A row per method on one data set; points without truth in some image count in none."""
     tracks = load_tracks(path)
-    assert tracks.points is not None, "an experiment needs tracks with truth"
-    known = np.isfinite(tracks.points).all(axis=(0, 2)) & tracks.visible.all(axis=0)
-    truth = tracks.points[:, known]
+    points = truth_of(tracks)
+    known = np.isfinite(points).all(axis=(0, 2)) & tracks.visible.all(axis=0)
+    truth = points[:, known]
     mesh = surface_mesh(tracks.pixels[0, known], lambda edges: np.zeros(len(edges)))
     apart = np.linalg.norm(truth[:, mesh.edges[:, 0]] - truth[:, mesh.edges[:, 1]], axis=-1).min(axis=0)
     edges = mesh.edges[apart > 0.1 * np.median(apart)]
@@ -143,10 +143,7 @@ def measure(options: Options) -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     methods = SHOWN[:1] if options.quick else SHOWN
     rows = [row for name, path in there.items() for row in compare(name, path, methods)]
-    with (options.out / "truth.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, fieldnames=[field.name for field in fields(Row)])
-        writer.writeheader()
-        writer.writerows(asdict(row) for row in rows)
+    save(options.out / "truth.csv", rows)
     text = markdown(rows)
     (options.out / "truth.md").write_text(text, encoding="utf-8")
     print(text)
