@@ -33,6 +33,9 @@ class RefineConfig:
     """Whether surfaces are kept from bending. Shared lengths alone already keep noise from crumpling a surface."""
     bending_sigma: float = 8.0
     """Standard deviation of the hinges' curvature vectors relative to their size."""
+    frontal_patches: tuple[int, ...] = (30, 100)
+    """Of how many independent patches in a view a surface may be taken to consist, each more likely seen frontally than
+    not, rising: how many the data say, by points left out. For the isometric model; empty for none."""
     uncertainty: bool = True
     """Whether the standard deviations of the depths are computed."""
     iterations: int = 30
@@ -48,6 +51,9 @@ class RefineConfig:
                 raise InputError(f"refine.{name} is {getattr(self, name)}, expected a positive number")
         if self.rings not in (1, 2):
             raise InputError(f"refine.rings is {self.rings}, expected 1 or 2")
+        patches = self.frontal_patches
+        if any(a >= b for a, b in zip((0, *patches), patches, strict=False)):
+            raise InputError(f"refine.frontal_patches is {list(patches)}, expected positive numbers that rise")
         if self.iterations < 1:
             raise InputError(f"refine.iterations is {self.iterations}, expected at least 1")
         if not 0.0 <= self.tolerance < 1.0:

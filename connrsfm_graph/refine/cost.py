@@ -14,6 +14,7 @@ from numba import njit
 
 from factors.bending import hinge_coefficients
 from factors.edge_length import log_chord_kernel
+from factors.frontal import log_foreshortening_kernel
 
 BENDING_CAP = 6.0
 """A hinge's coefficients are scaled down to at most this times their median: slivers carry no curvature."""
@@ -32,6 +33,8 @@ class Weights(NamedTuple):
     """Of log depths about their start; weak, it keeps points that nothing else holds from leaving for infinity."""
     unit: float
     """Of the mean log length; it fixes the unit of length."""
+    frontal: float
+    """Cost of an edge's log foreshortening in a view, no standard deviation; 0 where slants are not assumed small."""
 
 
 class Terms(NamedTuple):
@@ -73,7 +76,7 @@ def hinge_stencils(length, hinge_edges, coefficients):
 
 @njit(cache=True)
 def view_cost(X, f, drift, offset, correction, image_weight, length_weight, factor_weight, terms):
-    """Half the robust weighted sum of squares of one view.
+    """Half the robust weighted sum of squares of one view, and what its foreshortening costs.
 
     Args:
         X: (P, 3) points of the view.
@@ -98,6 +101,11 @@ def view_cost(X, f, drift, offset, correction, image_weight, length_weight, fact
                 total += 0.5 * (weights.smoothness * (f[i] - f[k])) ** 2
         r = abs(r * length_weight[e])
         total += 0.5 * r * r if r <= weights.huber else weights.huber * (r - 0.5 * weights.huber)
+        if weights.frontal > 0.0:
+            u = X[i, 0] / X[i, 2] - correction[i, 0] - X[k, 0] / X[k, 2] + correction[k, 0]
+            v = X[i, 1] / X[i, 2] - correction[i, 1] - X[k, 1] / X[k, 2] + correction[k, 1]
+            b_i, b_k = np.log(X[i, 2]), np.log(X[k, 2])
+            total += weights.frontal * log_foreshortening_kernel(u, v, b_i, b_k, log_length[e])
     for i in range(len(X)):
         total += 0.5 * (weights.drift * drift[i]) ** 2
         total += 0.5 * image_weight[i] ** 2 * (correction[i, 0] ** 2 + correction[i, 1] ** 2)
@@ -163,6 +171,8 @@ def linearise_view(
         for c in range(2 * m):
             border[e, c] = J[c]
         _add_row(matrix, row, gradient, at, J, 2 * m, w, r)
+        gradient[at[0]] -= 0.5 * weights.frontal
+        gradient[at[m]] -= 0.5 * weights.frontal
     for i in range(len(X)):
         n = unknown[i]
         matrix[row[n] + n] += weights.drift**2

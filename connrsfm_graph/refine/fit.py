@@ -11,6 +11,7 @@ from connrsfm_graph.refine.noise import Noise
 from connrsfm_graph.refine.reseat import reseat
 from connrsfm_graph.refine.restarts import inverted, restart
 from connrsfm_graph.refine.settle import BEYOND_DOUBT, noise_evidence, settled
+from connrsfm_graph.refine.slant import seen_frontally
 from connrsfm_graph.refine.solve import Measurements, Shape, costs, lag
 from connrsfm_graph.refine.start import start_shape
 from connrsfm_graph.refine.task import Fit, Task, minimised
@@ -71,6 +72,7 @@ def fit_isometric(task: Task, noise: Noise) -> Fit:
         found = _restarted_where_dear(task, found, lend=True)
     found = settled(task, _reseated(task, found))
     found = replace(_restarted_where_dear(task, found), first_cost=found.first_cost)
+    found = seen_frontally(task, found)
     found.evidence.update(noise_evidence(task, found))
     return found
 

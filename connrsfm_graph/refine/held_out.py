@@ -13,8 +13,9 @@ import numpy as np
 
 from connrsfm_graph.refine.solve import Measurements, Shape, minimise
 
-_PARTS, _USED = 5, 3
-"""Observations are dealt out at random to so many parts, of which so many are left out in turn."""
+_PARTS, _USED, _ENOUGH = 5, 3, 1000
+"""Observations are dealt out at random to so many parts, of which so many are left out in turn, fewer if those hold
+enough observations."""
 _LEFT_OUT = 1e-2
 """Factor on the weight of an image point that is left out: enough to keep it where nothing else holds it."""
 _ITERATIONS = 8
@@ -40,13 +41,21 @@ def prediction_errors(measurements: Measurements, shape: Shape, seen: np.ndarray
         weight = np.where(left_out, _LEFT_OUT, 1.0) * measurements.image_weight
         fitted, _ = minimise(replace(measurements, image_weight=weight), shape, _ITERATIONS, 0.0)
         errors.append((fitted.correction[left_out] ** 2).sum(axis=-1))
+        if sum(map(len, errors)) >= _ENOUGH:
+            break
     return np.concatenate(errors)
+
+
+def gain(errors: np.ndarray, than: np.ndarray) -> tuple[float, float]:
+    """Mean by which squared errors (N,) are smaller than others at the same points, and its standard error."""
+    if len(errors) < 2:
+        return 0.0, 0.0
+    most = _GROSS * float(np.median(than))
+    difference = np.minimum(than, most) - np.minimum(errors, most)
+    return float(difference.mean()), float(difference.std()) / float(np.sqrt(len(difference)))
 
 
 def predicts_better(errors: np.ndarray, than: np.ndarray) -> bool:
     """Whether squared errors (N,) of one fit are significantly smaller than those of another at the same points."""
-    if len(errors) < 2:
-        return False
-    most = _GROSS * float(np.median(than))
-    difference = np.minimum(errors, most) - np.minimum(than, most)
-    return bool(difference.mean() < -_SIGNIFICANT * difference.std() / np.sqrt(len(difference)))
+    mean, deviation = gain(errors, than)
+    return mean > _SIGNIFICANT * deviation

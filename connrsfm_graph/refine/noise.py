@@ -49,6 +49,9 @@ class Noise:
     """Inverse standard deviation of the shared log lengths about their start, in an isometric model."""
     huber: float = _HUBER[2]
     """Length residuals count linearly beyond so many standard deviations."""
+    patches: int = 0
+    """Independent patches of the surface in a view, of which each is more likely seen frontally (see
+    `factors.frontal`)."""
     release: float = 1.0
     """Factor on the uncertainty of interpolated image points."""
 

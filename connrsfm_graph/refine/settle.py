@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from connrsfm_graph.refine.held_out import prediction_errors, predicts_better
-from connrsfm_graph.refine.noise import Noise, neighbour_correlation
-from connrsfm_graph.refine.task import Fit, Task, minimised
+from connrsfm_graph.refine.noise import neighbour_correlation
+from connrsfm_graph.refine.task import Fit, Task, refitted
 
 BEYOND_DOUBT = 0.05
 """A fit that leaves less than this is right, whatever its ray corrections look like."""
@@ -35,7 +35,7 @@ def settled(task: Task, found: Fit) -> Fit:
             noise = noise.lowered_image(found.shape.correction[task.seen])
         if noise.settled(found.noise):
             break
-        again = _refitted(task, found, noise)
+        again = refitted(task, found, noise)
         freed = noise.release > found.noise.release and not task.seen.all()  # which moves lengths for a good reason
         moved = float(np.median(np.abs(again.shape.log_length - found.shape.log_length)))
         if noise.image < found.noise.image and moved > noise.length and not freed:
@@ -52,17 +52,11 @@ def _trusting_lengths(task: Task, found: Fit) -> Fit:
     errors = prediction_errors(found.measurements, found.shape, task.seen)
     trial = found
     for _ in range(_HALVINGS):
-        trial = _refitted(task, trial, trial.noise.halved_length())
+        trial = refitted(task, trial, trial.noise.halved_length())
         new = prediction_errors(trial.measurements, trial.shape, task.seen)
         if predicts_better(new, errors):
             found, errors = trial, new
     return found
-
-
-def _refitted(task: Task, found: Fit, noise: Noise) -> Fit:
-    measurements = task.measurements(noise, conformal=found.conformal)
-    shape, history = minimised(task, measurements, found.shape)
-    return replace(found, measurements=measurements, shape=shape, noise=noise, history=found.history + history)
 
 
 def noise_evidence(task: Task, found: Fit) -> dict[str, Any]:
@@ -72,6 +66,7 @@ def noise_evidence(task: Task, found: Fit) -> dict[str, Any]:
         "image noise": noise.image,
         "image noise over image length of an edge": float(np.sqrt(2.0)) * noise.image / noise.spacing,
         "length noise": noise.length,
+        "patches assumed frontal": noise.patches,
         "root mean square ray correction": float(np.sqrt((correction[task.seen] ** 2).mean())),
         "correlation of neighbours' ray corrections": neighbour_correlation(correction, task.seen, task.mesh)[0],
         "median absolute length residual": float(np.median(np.abs(found.residuals()))),

@@ -137,7 +137,7 @@ def _stencils(measurements: Measurements, shape: Shape) -> np.ndarray:
 
 
 def costs(measurements: Measurements, shape: Shape, lagged: Lagged) -> np.ndarray:
-    """(F,) cost of every view: half the robust weighted sum of squares."""
+    """(F,) cost of every view, see `view_cost`."""
     cost = np.empty(len(shape.log_depth))
     over_views(cost_kernel, len(cost), *kernel_arguments(measurements, shape, lagged), cost)
     return cost
@@ -159,7 +159,8 @@ def linearise(
     residual, weight = np.empty((F, E)), np.empty((F, E))
     arguments = kernel_arguments(measurements, shape, lagged)
     over_views(linearise_kernel, F, *arguments, envelope, matrix, gradient, border, residual, weight)
-    unit, prior = measurements.weights.unit, measurements.log_length_weight**2
+    unit, frontal = measurements.weights.unit, measurements.weights.frontal
+    prior = measurements.log_length_weight**2
     equations = NormalEquations(
         matrix=matrix,
         gradient=gradient,
@@ -168,6 +169,7 @@ def linearise(
         unit=unit,
         length_weight=prior,
         length_gradient=unit**2 * shape.log_length.mean() / E
+        + F * frontal
         + prior * (shape.log_length - measurements.log_length)
         - (weight * residual).sum(axis=0),
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from connrsfm_graph.refine.noise import Noise, neighbour_correlation
 from connrsfm_graph.refine.solve import Measurements, Shape, lag, linearise, minimise
 from connrsfm_graph.refine.start import start_mesh, start_shape
 from connrsfm_graph.refine.unseen import Completed
+from factors.frontal import PER_PATCH
 
 _UNIT = 1e3
 """Inverse standard deviation of the mean log length."""
@@ -73,6 +74,7 @@ class Task:
                 smoothness=1.0 / config.factor_sigma,
                 drift=_DRIFT,
                 unit=_UNIT,
+                frontal=0.0 if conformal else PER_PATCH * noise.patches / len(self.mesh.edges),
             ),
         )
 
@@ -120,3 +122,10 @@ class Fit:
 def minimised(task: Task, measurements: Measurements, shape: Shape) -> tuple[Shape, list[float]]:
     """The minimum from a shape, and the costs on the way."""
     return minimise(measurements, shape, task.config.iterations, task.config.tolerance)
+
+
+def refitted(task: Task, found: Fit, noise: Noise) -> Fit:
+    """A fit again, under other noise levels."""
+    measurements = task.measurements(noise, conformal=found.conformal)
+    shape, history = minimised(task, measurements, found.shape)
+    return replace(found, measurements=measurements, shape=shape, noise=noise, history=found.history + history)

@@ -34,7 +34,7 @@ def true_shape(scene: Scene, rings: int = 1) -> tuple[Measurements, Shape]:
         length_weight=np.full(residual.shape, 100.0),
         factor_weight=np.zeros(len(seen)),
         mesh=mesh,
-        weights=Weights(huber=1e9, bending=0.0, smoothness=0.0, drift=0.0, unit=0.0),
+        weights=Weights(huber=1e9, bending=0.0, smoothness=0.0, drift=0.0, unit=0.0, frontal=0.0),
     )
     return measurements, shape
 

@@ -16,6 +16,7 @@ from connrsfm_graph.refine.solve import Measurements, Shape, costs, fit_views, l
 from factors.adapter import make_factor
 from factors.bending import Bending
 from factors.edge_length import edge_length_factor
+from factors.frontal import frontal_factor
 from factors.image_point import image_point_factor
 from factors.keys import LOG_DEPTH, LOG_FACTOR, LOG_LENGTH, RAY_CORRECTION, key
 from factors.scale_smoothness import scale_smoothness_factor
@@ -23,7 +24,7 @@ from factors.scale_smoothness import scale_smoothness_factor
 F, P = 3, 9
 
 
-def _random_problem(conformal: bool, bending: bool, seed: int = 0) -> tuple[Measurements, Shape]:
+def _random_problem(conformal: bool, bending: bool, seed: int = 0, frontal: float = 0.7) -> tuple[Measurements, Shape]:
     rng = np.random.default_rng(seed)
     image = rng.uniform(-0.5, 0.5, (1, P, 2)) + rng.normal(0, 0.05, (F, P, 2))
     mesh = surface_mesh(image[0], lambda edges: np.zeros(len(edges)))
@@ -43,7 +44,7 @@ def _random_problem(conformal: bool, bending: bool, seed: int = 0) -> tuple[Meas
         length_weight=rng.uniform(5, 10, (F, E)),
         factor_weight=rng.uniform(0.1, 1, F),
         mesh=mesh,
-        weights=Weights(huber=1.0, bending=0.5 * bending, smoothness=5.0, drift=1.0, unit=0.0),
+        weights=Weights(huber=1.0, bending=0.5 * bending, smoothness=5.0, drift=1.0, unit=0.0, frontal=frontal),
     )
     return measurements, shape
 
@@ -80,6 +81,7 @@ def _graph(measurements: Measurements, shape: Shape) -> tuple[gtsam.NonlinearFac
             noise = gtsam.noiseModel.Robust.Create(loss, sigma(1, measurements.length_weight[j, e]))
             offset = lagged.offset[j, e]
             graph.add(edge_length_factor(e, i, k, j, image[i], image[k], noise, offset, conformal))
+            graph.add(frontal_factor(e, i, k, j, image[i], image[k], weights.frontal))
             if conformal and e < mesh.n_near:
                 graph.add(scale_smoothness_factor(i, k, j, sigma(1, weights.smoothness)))
         if weights.bending > 0:
@@ -91,8 +93,9 @@ def _graph(measurements: Measurements, shape: Shape) -> tuple[gtsam.NonlinearFac
 
 @pytest.mark.parametrize("conformal", [False, True])
 @pytest.mark.parametrize("bending", [False, True])
-def test_cost_and_step_equal_gtsams(conformal, bending):
-    measurements, shape = _random_problem(conformal, bending)
+@pytest.mark.parametrize("frontal", [0.0, 0.7])
+def test_cost_and_step_equal_gtsams(conformal, bending, frontal):
+    measurements, shape = _random_problem(conformal, bending, frontal=frontal)
     graph, values = _graph(measurements, shape)
     lagged = lag(measurements, shape)
     assert total_cost(measurements, shape, lagged) == pytest.approx(graph.error(values), rel=1e-12)

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from connrsfm_graph.refine import RefineConfig, refine
-from connrsfm_graph.refine.held_out import prediction_errors, predicts_better
+from connrsfm_graph.refine import RefineConfig, held_out, refine
+from connrsfm_graph.refine.held_out import gain, prediction_errors, predicts_better
 from connrsfm_graph.refine.noise import Noise
 from connrsfm_graph.refine.solve import Measurements, Shape, minimise
 from connrsfm_graph.refine.start import start_shape
@@ -38,6 +38,15 @@ def test_points_left_out_are_predicted_to_about_their_noise() -> None:
     assert 2 * sigma**2 < errors.mean() < 5 * sigma**2  # more than the fit's own corrections, of which it knows
     assert (shape.correction**2).sum(axis=-1).mean() < 0.9 * errors.mean()
     np.testing.assert_array_equal(errors, prediction_errors(measurements, shape, seen))
+
+
+def test_no_more_points_are_left_out_than_it_takes(monkeypatch: pytest.MonkeyPatch) -> None:
+    measurements, shape, seen, _ = fitted(0.01)
+    errors = prediction_errors(measurements, shape, seen)
+    monkeypatch.setattr(held_out, "_ENOUGH", 50)
+    fewer = prediction_errors(measurements, shape, seen)
+    assert 50 <= len(fewer) < 0.3 * seen.sum()
+    np.testing.assert_array_equal(fewer, errors[: len(fewer)])
 
 
 def test_what_a_point_left_out_says_is_not_used() -> None:
@@ -71,6 +80,9 @@ def test_chance_is_not_better() -> None:
     assert predicts_better(0.9 * errors, errors)
     assert not predicts_better(errors, wild * 0.9)  # gross errors do not decide
     assert not predicts_better(errors[:1] - 1, errors[:1])
+    mean, deviation = gain(0.9 * errors, errors)
+    assert mean == pytest.approx(0.1 * errors.mean(), rel=0.02)
+    assert deviation == pytest.approx(0.1 * errors.std() / np.sqrt(500), rel=0.1)
 
 
 @pytest.mark.parametrize(

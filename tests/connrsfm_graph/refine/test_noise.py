@@ -24,7 +24,7 @@ def test_image_noise_is_lowered_only_while_the_lengths_stay(monkeypatch, moved):
     tracks = scene.tracks
     completed = complete(tracks.normalised(), tracks.visible, scene.log_depth)
     task = Task.of(completed, tracks.visible, RefineConfig(uncertainty=False))
-    assumed, refitted = [], settle._refitted
+    assumed, refitted = [], settle.refitted
 
     def moving(task: Task, found: Fit, noise: Noise) -> Fit:
         assumed.append(noise.image)
@@ -32,7 +32,7 @@ def test_image_noise_is_lowered_only_while_the_lengths_stay(monkeypatch, moved):
         shift = 2.0 * noise.length if moved else 0.0
         return replace(again, shape=replace(again.shape, log_length=again.shape.log_length + shift))
 
-    monkeypatch.setattr(settle, "_refitted", moving)
+    monkeypatch.setattr(settle, "refitted", moving)
     found = fit(task, SIGMA)
     assert not found.noisy
     assert min(assumed) < 0.5 * SIGMA

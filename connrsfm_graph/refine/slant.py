@@ -1,0 +1,41 @@
+"""Slants that the data leave open: seen frontally, as far as points left out allow.
+
+Where tracks tell little, as of a surface that hardly bends before a camera that hardly moves, surfaces of many slants
+fit them nearly equally well, and the noise decides between them. Slants that a visible surface has by chance are a
+better judge (see `factors.frontal`). How much is left to them the data say, by points that the fit was not given.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from connrsfm_graph.refine.held_out import gain, prediction_errors
+from connrsfm_graph.refine.settle import BEYOND_DOUBT
+from connrsfm_graph.refine.task import Fit, Task, refitted
+
+_COMPARED, _TAKEN = (12, 3e-4), (60, 1e-4)
+"""Iterations at most and tolerance of the fits that are compared, and of the one that is taken: slants move last."""
+
+
+def seen_frontally(task: Task, found: Fit) -> Fit:
+    """An isometric fit, its surfaces taken to be seen frontally as far as points left out allow.
+
+    Taken is the strongest prior of which points left out cannot tell, by one standard error, whether it predicts them
+    worse than the one that predicts them best (the one-standard-error rule of Breiman et al. 1984).
+    """
+    if found.misfit() < BEYOND_DOUBT or not task.config.frontal_patches:
+        return found
+    compared, taken = (
+        replace(task, config=replace(task.config, iterations=iterations, tolerance=tolerance))
+        for iterations, tolerance in (_COMPARED, _TAKEN)
+    )
+    trials = [refitted(compared, found, found.noise)]
+    for patches in task.config.frontal_patches:
+        trials.append(refitted(compared, trials[-1], replace(found.noise, patches=patches)))
+    errors = [prediction_errors(trial.measurements, trial.shape, task.seen) for trial in trials]
+    best = max(errors, key=lambda error: gain(error, errors[0])[0])
+    for trial, error in zip(trials[:0:-1], errors[:0:-1], strict=True):
+        lost, deviation = gain(best, error)
+        if lost <= deviation:
+            return refitted(taken, trial, trial.noise)
+    return found
