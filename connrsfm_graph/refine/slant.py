@@ -9,12 +9,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
 from connrsfm_graph.refine.held_out import gain, prediction_errors
 from connrsfm_graph.refine.settle import BEYOND_DOUBT
 from connrsfm_graph.refine.task import Fit, Task, refitted
 
 _COMPARED, _TAKEN = (12, 3e-4), (60, 1e-4)
 """Iterations at most and tolerance of the fits that are compared, and of the one that is taken: slants move last."""
+_FLATTENED = 0.25
+"""Part of their relief that surfaces keep in a second start: what is far too steep comes down slowly by itself."""
 
 
 def seen_frontally(task: Task, found: Fit) -> Fit:
@@ -30,8 +34,11 @@ def seen_frontally(task: Task, found: Fit) -> Fit:
         for iterations, tolerance in (_COMPARED, _TAKEN)
     )
     trials = [refitted(compared, found, found.noise)]
+    starts = [found, _flattened(found)]
     for patches in task.config.frontal_patches:
-        trials.append(refitted(compared, trials[-1], replace(found.noise, patches=patches)))
+        noise = replace(found.noise, patches=patches)
+        trials.append(min((refitted(compared, start, noise) for start in starts), key=lambda fit: fit.history[-1]))
+        starts = trials[-1:]
     errors = [prediction_errors(trial.measurements, trial.shape, task.seen) for trial in trials]
     best = max(errors, key=lambda error: gain(error, errors[0])[0])
     for trial, error in zip(trials[:0:-1], errors[:0:-1], strict=True):
@@ -39,3 +46,13 @@ def seen_frontally(task: Task, found: Fit) -> Fit:
         if lost <= deviation:
             return refitted(taken, trial, trial.noise)
     return found
+
+
+def _flattened(found: Fit) -> Fit:
+    """Less relief in all views, and the lengths that these then show."""
+    shape = found.shape
+    mean = shape.log_depth.mean(axis=1, keepdims=True)
+    less = replace(shape, log_depth=mean + _FLATTENED * (shape.log_depth - mean))
+    length = less.log_length + np.median(replace(found, shape=less).residuals(), axis=0)
+    unit = length.mean()
+    return replace(found, shape=replace(less, log_depth=less.log_depth - unit, log_length=length - unit))

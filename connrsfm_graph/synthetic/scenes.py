@@ -57,6 +57,7 @@ def isometric_bending(
     n_points: int = 100,
     bend: float = 0.8,
     smooth: bool = False,
+    at_rest: bool = False,
     seed: int = 0,
     camera: Camera = PERSPECTIVE,
 ) -> Scene:
@@ -66,6 +67,7 @@ def isometric_bending(
         n_frames, n_points: F and P.
         bend: largest curvature, in radians over half the sheet's width.
         smooth: whether frames follow one another in a smooth motion, as in a video, or are drawn independently.
+        at_rest: whether frames that are drawn independently have their pose in common, as before a camera at rest.
         seed: of points and motion.
         camera: of all frames.
     """
@@ -75,7 +77,10 @@ def isometric_bending(
     def draw(motion: np.ndarray) -> Jet:
         return _placed(_rolled(sheet, bend * motion[0], np.pi * motion[1]), motion[2:], tilt_deg=25.0, fill=(0.75, 1.0))
 
-    if not smooth:
+    if at_rest:
+        pose = rng.uniform(-1.0, 1.0, 6)
+        surfaces = [_facing_draw(lambda: draw(np.r_[rng.uniform(-1.0, 1.0, 2), pose]), camera) for _ in range(n_frames)]
+    elif not smooth:
         surfaces = [_facing_draw(lambda: draw(rng.uniform(-1.0, 1.0, 8)), camera) for _ in range(n_frames)]
     else:
         surfaces = _facing_draws(lambda: [draw(motion) for motion in _smooth_motion(n_frames, 8, rng)], camera)
