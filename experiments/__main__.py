@@ -19,7 +19,7 @@ from experiments.publish import publish
 from experiments.real import FLAG, KINECT_PAPER, TSHIRT
 from experiments.study import Experiment, Options
 from experiments.summary import summarise
-from experiments.synthetic import MIXED, ORTHOGRAPHIC_SCENES, SPHERES
+from experiments.synthetic import AT_REST, MIXED, ORTHOGRAPHIC_SCENES, SPHERES
 from experiments.timing import PARALLEL, TIME
 
 TABLES: tuple[Experiment, ...] = (
@@ -37,6 +37,7 @@ TABLES: tuple[Experiment, ...] = (
     FLAG,
     MIXED,
     ORTHOGRAPHIC_SCENES,
+    AT_REST,
 )
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 

@@ -1,5 +1,5 @@
-"""The paper's synthetic data sets: spheres related by similarities, and isometric mixed with conformal images; and
-spheres and bent sheets seen by orthographic cameras.
+"""The paper's synthetic data sets: spheres related by similarities, and isometric mixed with conformal images; spheres
+and bent sheets seen by orthographic cameras; and bent sheets before a camera at rest, whose slants tracks hardly tell.
 
 Published figures belong to the paper's own random scenes, of which only the description is public.
 """
@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from functools import partial
 
-from connrsfm_graph.synthetic import isometric_bending, mixed, spheres
+from connrsfm_graph.config import override
+from connrsfm_graph.synthetic import isometric_bending, mixed, spheres, with_noise
 from connrsfm_graph.synthetic.scene import Scene
 from connrsfm_graph.tracks import Tracks
 from experiments.study import VARIANTS, Case, Experiment, Options
@@ -69,4 +70,28 @@ def _orthographic(options: Options) -> Iterable[Case]:
 
 ORTHOGRAPHIC_SCENES = Experiment(
     "orthographic", "Orthographic cameras: 7 images, 100 points, up to one mirror image in depth", _orthographic
+)
+
+BENDS = (0.1, 0.2, 0.4, 0.8)
+"""Largest curvature of the sheets before a camera at rest, radians over half their width."""
+
+
+def _noisy_at_rest(size: tuple[int, int], bend: float, seed: int) -> Tracks:
+    return with_noise(isometric_bending(*size, bend=bend, at_rest=True, seed=seed).tracks, 1.0, seed)
+
+
+def _at_rest(options: Options) -> Iterable[Case]:
+    """All methods, and the default without its prior on slants."""
+    size = (5, 40) if options.quick else (15, 100)
+    method, config = VARIANTS["default"]
+    without = {"default without the prior": (method, override(config, ["refine.frontal_patches=[]"]))}
+    for bend in BENDS[1:2] if options.quick else BENDS:
+        for name, (method, config) in {"default": VARIANTS["default"], **without, **VARIANTS}.items():
+            for seed in options.seeds():
+                keys = {"bend": bend, "method": name, "seed": seed}
+                yield Case(keys, partial(_noisy_at_rest, size, bend, seed), method, config)
+
+
+AT_REST = Experiment(
+    "at_rest", "A sheet that bends before a camera at rest: 15 images, 100 points, 1 px noise", _at_rest, x="bend"
 )

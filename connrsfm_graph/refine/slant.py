@@ -1,4 +1,4 @@
-"""Slants that the data leave open: seen frontally, as far as points left out allow.
+"""Slants that the data leave open: seen frontally, as far as points left out say.
 
 Where tracks tell little, as of a surface that hardly bends before a camera that hardly moves, surfaces of many slants
 fit them nearly equally well, and the noise decides between them. Slants that a visible surface has by chance are a
@@ -22,10 +22,9 @@ _FLATTENED = 0.25
 
 
 def seen_frontally(task: Task, found: Fit) -> Fit:
-    """An isometric fit, its surfaces taken to be seen frontally as far as points left out allow.
+    """An isometric fit, its surfaces taken to be seen frontally as far as points left out say.
 
-    Taken is the strongest prior of which points left out cannot tell, by one standard error, whether it predicts them
-    worse than the one that predicts them best (the one-standard-error rule of Breiman et al. 1984).
+    Taken is the prior with which points left out are predicted best, where that is better than without any.
     """
     if found.misfit() < BEYOND_DOUBT or not task.config.frontal_patches:
         return found
@@ -33,19 +32,18 @@ def seen_frontally(task: Task, found: Fit) -> Fit:
         replace(task, config=replace(task.config, iterations=iterations, tolerance=tolerance))
         for iterations, tolerance in (_COMPARED, _TAKEN)
     )
-    trials = [refitted(compared, found, found.noise)]
+    without = refitted(compared, found, found.noise)
+    errors = prediction_errors(without.measurements, without.shape, task.seen)
+    best, most = found, 0.0
     starts = [found, _flattened(found)]
     for patches in task.config.frontal_patches:
         noise = replace(found.noise, patches=patches)
-        trials.append(min((refitted(compared, start, noise) for start in starts), key=lambda fit: fit.history[-1]))
-        starts = trials[-1:]
-    errors = [prediction_errors(trial.measurements, trial.shape, task.seen) for trial in trials]
-    best = max(errors, key=lambda error: gain(error, errors[0])[0])
-    for trial, error in zip(trials[:0:-1], errors[:0:-1], strict=True):
-        lost, deviation = gain(best, error)
-        if lost <= deviation:
-            return refitted(taken, trial, trial.noise)
-    return found
+        trial = min((refitted(compared, start, noise) for start in starts), key=lambda fit: fit.history[-1])
+        better_by, _ = gain(prediction_errors(trial.measurements, trial.shape, task.seen), errors)
+        if better_by > most:
+            best, most = trial, better_by
+        starts = [trial]
+    return found if best is found else refitted(taken, best, best.noise)
 
 
 def _flattened(found: Fit) -> Fit:

@@ -1,29 +1,24 @@
-"""Slants that the data leave open: seen frontally where points left out allow it."""
+"""Slants that the data leave open: seen frontally where that predicts points left out."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from connrsfm_graph.metrics import evaluate
 from connrsfm_graph.refine import RefineConfig, Refined, refine
 from connrsfm_graph.refine.solve import Measurements
+from connrsfm_graph.synthetic import isometric_bending
 
-SIGMA = 0.002
+SIGMA = 0.0015
 """Noise of the image points, normalised coordinates."""
 
 
 def at_rest(n_frames: int, n_points: int, seed: int) -> np.ndarray:
-    """(F, P, 3) a sheet of size 2 x 2 that bends a little before a camera at rest."""
-    rng = np.random.default_rng(seed)
-    u, v = rng.uniform(-1.0, 1.0, (2, n_points))
-    turn = Rotation.from_euler("xyz", rng.uniform(-10.0, 10.0, 3), degrees=True).as_matrix()
-    views = []
-    for bend, saddle in rng.uniform(-0.1, 0.1, (n_frames, 2)):
-        sheet = np.stack([u, v, bend * np.sin(2.0 * u) + saddle * u * v], axis=-1)
-        views.append(sheet @ turn.T + [0.0, 0.0, 4.0])
-    return np.array(views)
+    """(F, P, 3) a sheet that bends a little before a camera at rest."""
+    points = isometric_bending(n_frames, n_points, bend=0.2, at_rest=True, seed=seed).tracks.points
+    assert points is not None
+    return points
 
 
 def refined(points: np.ndarray, sigma: float, patches: tuple[int, ...] | None = None) -> Refined:
@@ -41,13 +36,12 @@ def refined(points: np.ndarray, sigma: float, patches: tuple[int, ...] | None = 
     [
         ({30: 0.2, 100: 0.3}, 100),
         ({30: 0.2, 100: 0.1}, 30),
-        ({30: 0.0, 100: 0.0}, 100),
-        ({30: 0.0, 100: -0.1}, 30),
+        ({30: 0.0, 100: 0.0}, 0),
         ({30: -0.1, 100: 0.1}, 100),
         ({30: -0.1, 100: -0.1}, 0),
     ],
 )
-def test_the_strongest_prior_that_predicts_as_well_as_the_best_is_taken(
+def test_the_prior_that_predicts_points_left_out_best_is_taken(
     monkeypatch: pytest.MonkeyPatch, gains: dict[int, float], taken: int
 ) -> None:
     errors = np.random.default_rng(0).chisquare(2, 500)
@@ -55,20 +49,6 @@ def test_the_strongest_prior_that_predicts_as_well_as_the_best_is_taken(
     def canned(measurements: Measurements, *arguments: object) -> np.ndarray:
         patches = round(measurements.weights.frontal * len(measurements.mesh.edges) / 8.0)
         return np.asarray((1.0 - {0: 0.0, **gains}[patches]) * errors)
-
-    monkeypatch.setattr("connrsfm_graph.refine.slant.prediction_errors", canned)
-    assert refined(at_rest(5, 30, 0), SIGMA).evidence["patches assumed frontal"] == taken
-
-
-@pytest.mark.parametrize(("worse_by", "taken"), [(0.5, 100), (2.0, 0)])
-def test_worse_by_chance_is_not_worse(monkeypatch: pytest.MonkeyPatch, worse_by: float, taken: int) -> None:
-    """By so many standard errors of the difference."""
-    rng = np.random.default_rng(0)
-    errors, chance = rng.uniform(1.0, 2.0, 500), rng.normal(0.0, 0.1, 500)
-    chance += worse_by * chance.std() / np.sqrt(len(chance)) - chance.mean()
-
-    def canned(measurements: Measurements, *arguments: object) -> np.ndarray:
-        return np.asarray(errors + chance if measurements.weights.frontal > 0.0 else errors)
 
     monkeypatch.setattr("connrsfm_graph.refine.slant.prediction_errors", canned)
     assert refined(at_rest(5, 30, 0), SIGMA).evidence["patches assumed frontal"] == taken
@@ -88,9 +68,9 @@ def test_exact_data_and_no_patches_leave_nothing_to_assume(monkeypatch: pytest.M
 
 @pytest.mark.slow
 def test_slants_that_the_data_leave_open_are_nearer_to_the_truth() -> None:
-    scenes = [at_rest(10, 60, seed) for seed in range(6)]
+    scenes = [at_rest(15, 100, seed) for seed in range(4)]
     with_it, without = (
         [evaluate(refined(points, SIGMA, patches).points, points).e3d_percent for points in scenes]
         for patches in (None, ())
     )
-    assert np.exp(np.mean(np.log(with_it) - np.log(without))) < 0.85
+    assert np.exp(np.mean(np.log(with_it) - np.log(without))) < 0.8
