@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from connrsfm_graph.errors import InputError
 from connrsfm_graph.synthetic import Scene, isometric_bending, mixed, moebius, scenes, spheres
@@ -179,3 +180,14 @@ def test_inversion_about_the_camera_centre_is_not_observable() -> None:
     ]
     np.testing.assert_allclose(residual[1], residual[0], atol=1e-11)
     assert np.ptp(other.log_size[frame] - scene.log_size[frame]) > 0.1
+
+
+def test_before_a_camera_at_rest_only_the_bending_varies() -> None:
+    flat, bent = (isometric_bending(4, 30, bend=bend, at_rest=True, seed=3).tracks.points for bend in (1e-5, 0.8))
+    assert flat is not None
+    assert bent is not None
+    assert np.ptp(flat, axis=0).max() < 1e-3
+    assert np.ptp(bent, axis=0).max() > 0.1
+    centred = bent - bent.mean(axis=1, keepdims=True)
+    turned = [Rotation.align_vectors(view, centred[0])[0].magnitude() for view in centred]
+    assert np.degrees(max(turned)) < 10.0
