@@ -8,9 +8,10 @@ half of -log cos(theta) to second order, so that the same prior is
 
     C = 8 N / E sum over the E edges of e - (b_i + b_k) / 2 - log |x_i - x_k|,
 
-with e the log length of the edge, b the log depths of its ends and x their tracked image points. It is linear, which
-makes it a number more in the gradient and nothing in the Hessian: it never leads away from what the data tell, only
-along what they leave open. It is the maximum-depth heuristic (Perriollat, Hartley and Bartoli 2011) as a prior.
+with e the log length of the edge, b the log depths of its ends and x their tracked image points. It is linear, a number
+more in the gradient and nothing in the Hessian, and moves shapes most along what the data leave open. It is the
+maximum-depth heuristic (Perriollat, Hartley and Bartoli 2011) as a prior. Patches count as independent in every view:
+of a slant that all views have in common, as before a camera at rest, it is too sure.
 """
 
 from __future__ import annotations

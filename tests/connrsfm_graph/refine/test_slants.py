@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 
 from connrsfm_graph.metrics import evaluate
-from connrsfm_graph.refine import RefineConfig, Refined, refine
+from connrsfm_graph.refine import RefineConfig, Refined, refine, slant
+from connrsfm_graph.refine.noise import Noise
 from connrsfm_graph.refine.solve import Measurements
+from connrsfm_graph.refine.start import start_shape
+from connrsfm_graph.refine.task import Fit, Task
+from connrsfm_graph.refine.unseen import complete
 from connrsfm_graph.synthetic import isometric_bending
 
 SIGMA = 0.0015
@@ -52,6 +56,19 @@ def test_the_prior_that_predicts_points_left_out_best_is_taken(
 
     monkeypatch.setattr("connrsfm_graph.refine.slant.prediction_errors", canned)
     assert refined(at_rest(5, 30, 0), SIGMA).evidence["patches assumed frontal"] == taken
+
+
+def test_flattened_surfaces_have_less_relief_and_lengths_to_match() -> None:
+    points = at_rest(5, 30, 0)
+    image, seen = points[..., :2] / points[..., 2:], np.ones(points.shape[:2], dtype=bool)
+    task = Task.of(complete(image, seen, np.log(points[..., 2])), seen, RefineConfig())
+    noise = Noise.start(SIGMA, 0.01, task.spacing())
+    found = Fit(task.measurements(noise, conformal=False), start_shape(task.completed, task.mesh), noise, [], 0.0)
+    flat = slant._flattened(found)
+    relief = np.ptp(found.shape.log_depth, axis=1)
+    np.testing.assert_allclose(np.ptp(flat.shape.log_depth, axis=1), 0.25 * relief)
+    assert flat.shape.log_length.mean() == pytest.approx(0.0, abs=1e-12)
+    assert np.median(flat.residuals(), axis=0) == pytest.approx(np.zeros(len(task.mesh.edges)), abs=1e-12)
 
 
 def test_exact_data_and_no_patches_leave_nothing_to_assume(monkeypatch: pytest.MonkeyPatch) -> None:
