@@ -45,13 +45,13 @@ def fit(task: Task, sigma_image: float) -> Fit:
     misfit = isometric.misfit()
     isometric.evidence["isometric misfit"] = misfit
     if wanted == "isometric" or misfit <= _MISFIT:
-        return isometric
+        return _seen_frontally(task, isometric)
     conformal = fit_conformal(task, noise)
     ratio = isometric.first_cost / max(conformal.first_cost, 1e-300)
     for found in (isometric, conformal):
         found.evidence["isometric misfit"] = misfit
         found.evidence["isometric over conformal cost"] = ratio
-    return conformal if ratio > _RATIO else isometric
+    return conformal if ratio > _RATIO else _seen_frontally(task, isometric)
 
 
 def fit_isometric(task: Task, noise: Noise) -> Fit:
@@ -71,8 +71,12 @@ def fit_isometric(task: Task, noise: Noise) -> Fit:
     if found.misfit() > _MISFIT:
         found = _restarted_where_dear(task, found, lend=True)
     found = settled(task, _reseated(task, found))
-    found = replace(_restarted_where_dear(task, found), first_cost=found.first_cost)
-    found = seen_frontally(task, found)
+    return replace(_restarted_where_dear(task, found), first_cost=found.first_cost)
+
+
+def _seen_frontally(task: Task, isometric: Fit) -> Fit:
+    """The isometric fit that is taken, with the prior on slants that the data ask for."""
+    found = seen_frontally(task, isometric)
     found.evidence.update(noise_evidence(task, found))
     return found
 

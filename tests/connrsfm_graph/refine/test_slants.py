@@ -12,7 +12,7 @@ from connrsfm_graph.refine.solve import Measurements
 from connrsfm_graph.refine.start import start_shape
 from connrsfm_graph.refine.task import Fit, Task
 from connrsfm_graph.refine.unseen import complete
-from connrsfm_graph.synthetic import isometric_bending
+from connrsfm_graph.synthetic import isometric_bending, moebius
 
 SIGMA = 0.0015
 """Noise of the image points, normalised coordinates."""
@@ -81,6 +81,18 @@ def test_exact_data_and_no_patches_leave_nothing_to_assume(monkeypatch: pytest.M
     assert refined(points, SIGMA, ()).evidence["patches assumed frontal"] == 0
     with pytest.raises(AssertionError, match="slants were compared"):
         refined(points, SIGMA)
+
+
+def test_what_is_taken_for_conformal_has_no_slants_compared(monkeypatch: pytest.MonkeyPatch) -> None:
+    def never(*arguments: object) -> np.ndarray:
+        raise AssertionError("slants were compared")
+
+    monkeypatch.setattr("connrsfm_graph.refine.slant.prediction_errors", never)
+    points = moebius(5, 60).tracks.points
+    assert points is not None
+    found = refined(points, 1e-6)
+    assert found.evidence["isometric misfit"] > 1.0
+    assert found.model == "conformal"
 
 
 @pytest.mark.slow
