@@ -35,6 +35,10 @@ def refined(points: np.ndarray, sigma: float, patches: tuple[int, ...] | None = 
     return refine(image, np.ones(points.shape[:2], dtype=bool), np.zeros_like(points[..., 2]), settings, sigma)
 
 
+def never(*arguments: object) -> np.ndarray:
+    raise AssertionError("slants were compared")
+
+
 @pytest.mark.parametrize(
     ("gains", "taken"),
     [
@@ -72,9 +76,6 @@ def test_flattened_surfaces_have_less_relief_and_lengths_to_match() -> None:
 
 
 def test_exact_data_and_no_patches_leave_nothing_to_assume(monkeypatch: pytest.MonkeyPatch) -> None:
-    def never(*arguments: object) -> np.ndarray:
-        raise AssertionError("slants were compared")
-
     monkeypatch.setattr("connrsfm_graph.refine.slant.prediction_errors", never)
     points = at_rest(5, 30, 0)
     assert refined(points, 1e-7).evidence["patches assumed frontal"] == 0
@@ -84,9 +85,6 @@ def test_exact_data_and_no_patches_leave_nothing_to_assume(monkeypatch: pytest.M
 
 
 def test_what_is_taken_for_conformal_has_no_slants_compared(monkeypatch: pytest.MonkeyPatch) -> None:
-    def never(*arguments: object) -> np.ndarray:
-        raise AssertionError("slants were compared")
-
     monkeypatch.setattr("connrsfm_graph.refine.slant.prediction_errors", never)
     points = moebius(5, 60).tracks.points
     assert points is not None
