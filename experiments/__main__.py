@@ -19,7 +19,7 @@ from experiments.publish import publish
 from experiments.real import FLAG, KINECT_PAPER, TSHIRT
 from experiments.study import Experiment, Options
 from experiments.summary import summarise
-from experiments.synthetic import AT_REST, MIXED, ORTHOGRAPHIC_SCENES, SPHERES
+from experiments.synthetic import AT_REST, MIXED, ORTHOGRAPHIC_SCENES, SPHERES, VARIETY
 from experiments.timing import PARALLEL, TIME
 
 TABLES: tuple[Experiment, ...] = (
@@ -38,6 +38,7 @@ TABLES: tuple[Experiment, ...] = (
     MIXED,
     ORTHOGRAPHIC_SCENES,
     AT_REST,
+    VARIETY,
 )
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 

@@ -1,5 +1,6 @@
 """The paper's synthetic data sets: spheres related by similarities, and isometric mixed with conformal images; spheres
-and bent sheets seen by orthographic cameras; and bent sheets before a camera at rest, whose slants tracks hardly tell.
+and bent sheets seen by orthographic cameras; bent sheets before a camera at rest, whose slants tracks hardly tell; and
+scenes of many kinds, in which all else is random.
 
 Published figures belong to the paper's own random scenes, of which only the description is public.
 """
@@ -10,8 +11,9 @@ from collections.abc import Callable, Iterable
 from functools import partial
 
 from connrsfm_graph.config import override
-from connrsfm_graph.synthetic import isometric_bending, mixed, spheres, with_noise
+from connrsfm_graph.synthetic import isometric_bending, mixed, spheres, varied, with_noise
 from connrsfm_graph.synthetic.scene import Scene
+from connrsfm_graph.synthetic.variety import KINDS
 from connrsfm_graph.tracks import Tracks
 from experiments.study import VARIANTS, Case, Experiment, Options
 from factors.surface import ORTHOGRAPHIC
@@ -94,4 +96,19 @@ def _at_rest(options: Options) -> Iterable[Case]:
 
 AT_REST = Experiment(
     "at_rest", "A sheet that bends before a camera at rest: 15 images, 100 points, 1 px noise", _at_rest, x="bend"
+)
+
+
+def _variety(options: Options) -> Iterable[Case]:
+    for kind in list(KINDS)[1:2] if options.quick else KINDS:
+        for seed in options.seeds():
+            for name, (method, config) in VARIANTS.items():
+                yield Case({"kind": kind, "method": name, "seed": seed}, partial(varied, kind, seed), method, config)
+
+
+VARIETY = Experiment(
+    "variety",
+    "Scenes of many kinds: 6 to 20 images, 40 to 250 points, 0.3 to 3 px noise, camera at rest or moving, up to 40 % "
+    "missing, all at random",
+    _variety,
 )

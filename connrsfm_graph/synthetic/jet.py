@@ -106,6 +106,10 @@ class Jet:
     def sin(self) -> Jet:
         return self._through(np.sin(self.value), np.cos(self.value), -np.sin(self.value))
 
+    def arctan(self) -> Jet:
+        slope = 1.0 / (1.0 + self.value**2)
+        return self._through(np.arctan(self.value), slope, -2.0 * self.value * slope**2)
+
     def squared_norm(self) -> Jet:
         """Squared length of a vector of jets."""
         return Jet((self * self).data.sum(axis=1))

@@ -12,12 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from connrsfm_graph.synthetic.scene import FOCAL_LENGTH, HEIGHT, WIDTH
+from connrsfm_graph.synthetic.placing import HALF_FIELD, SHEET
 
-HALF_FIELD = np.array([WIDTH, HEIGHT]) / (2 * FOCAL_LENGTH)
-"""Half the field of view in normalised image coordinates."""
-_SHEET = np.array([1.0, 0.75])
-"""Half-sides of the sheet."""
 _ARC_STEPS = 401
 
 
@@ -62,7 +58,7 @@ def passing_camera(
         seed: of the points' places.
     """
     rng = np.random.default_rng(seed)
-    sheet = rng.uniform(-_SHEET, _SHEET, (n_points, 2))
+    sheet = rng.uniform(-SHEET, SHEET, (n_points, 2))
     time = np.linspace(0.0, 1.0, n_frames)
     points = np.stack([_waving(sheet, swing, moment * n_frames / 40.0) for moment in time])
     poses = _path(time, np.radians(bow_deg))
@@ -124,7 +120,7 @@ def relative_depth(
 
 def _waving(sheet: np.ndarray, swing: float, phase: float) -> np.ndarray:
     """Points (P, 3) of the sheet: waves along its length that run one wave per unit of `phase`."""
-    arc = np.linspace(-_SHEET[0], _SHEET[0], _ARC_STEPS)
+    arc = np.linspace(-SHEET[0], SHEET[0], _ARC_STEPS)
     slope = swing * np.sin(2.0 * np.pi * (0.7 * arc - phase))
     x, z = (_integral(curve, arc) for curve in (np.cos(slope), np.sin(slope)))
     return np.column_stack([np.interp(sheet[:, 0], arc, x), sheet[:, 1], np.interp(sheet[:, 0], arc, z)])

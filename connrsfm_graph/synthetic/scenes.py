@@ -1,11 +1,10 @@
 """The synthetic scenes: spheres, bent sheets, Moebius images, and sheets mixed with Moebius images.
 
-Each draws its frames at random from a seed and keeps those whose surface faces the camera everywhere.
+Each draws its frames at random from a seed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -14,15 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from connrsfm_graph.errors import InputError
 from connrsfm_graph.synthetic.jet import Jet
-from connrsfm_graph.synthetic.scene import FOCAL_LENGTH, HEIGHT, WIDTH, Scene, facing, inward_normal
+from connrsfm_graph.synthetic.placing import facing_draw, facing_draws, flat_sheet, placed, rolled, smooth_motion
+from connrsfm_graph.synthetic.scene import Scene, inward_normal
 from factors.surface import PERSPECTIVE, Camera
-
-LEAST_FACING = 0.1
-"""Points keep about 6 degrees from the horizon, where no tracker would hold them."""
-HALF_FIELD = np.array([WIDTH, HEIGHT]) / (2 * FOCAL_LENGTH)
-"""Half the field of view in normalised image coordinates."""
-SHEET = np.array([1.0, 0.75])
-"""Half-sides of the flat sheet."""
 
 
 def spheres(
@@ -47,9 +40,9 @@ def spheres(
     cap = Jet.stack([s, t, -((1.0 - s * s - t * t) ** 0.5)])
 
     def draw() -> Jet:
-        return _placed(cap * rng.uniform(0.5, 2.0), rng.uniform(-1.0, 1.0, 6), tilt_deg=30.0, fill=(0.6, 0.95))
+        return placed(cap * rng.uniform(0.5, 2.0), rng.uniform(-1.0, 1.0, 6), tilt_deg=30.0, fill=(0.6, 0.95))
 
-    return Scene.of([_facing_draw(draw, camera) for _ in range(n_frames)], camera)
+    return Scene.of([facing_draw(draw, camera) for _ in range(n_frames)], camera)
 
 
 def isometric_bending(
@@ -72,18 +65,18 @@ def isometric_bending(
         camera: of all frames.
     """
     rng = np.random.default_rng(seed)
-    sheet = _sheet(n_points, rng)
+    sheet = flat_sheet(n_points, rng)
 
     def draw(motion: np.ndarray) -> Jet:
-        return _placed(_rolled(sheet, bend * motion[0], np.pi * motion[1]), motion[2:], tilt_deg=25.0, fill=(0.75, 1.0))
+        return placed(rolled(sheet, bend * motion[0], np.pi * motion[1]), motion[2:], tilt_deg=25.0, fill=(0.75, 1.0))
 
     if at_rest:
         pose = rng.uniform(-1.0, 1.0, 6)
-        surfaces = [_facing_draw(lambda: draw(np.r_[rng.uniform(-1.0, 1.0, 2), pose]), camera) for _ in range(n_frames)]
+        surfaces = [facing_draw(lambda: draw(np.r_[rng.uniform(-1.0, 1.0, 2), pose]), camera) for _ in range(n_frames)]
     elif not smooth:
-        surfaces = [_facing_draw(lambda: draw(rng.uniform(-1.0, 1.0, 8)), camera) for _ in range(n_frames)]
+        surfaces = [facing_draw(lambda: draw(rng.uniform(-1.0, 1.0, 8)), camera) for _ in range(n_frames)]
     else:
-        surfaces = _facing_draws(lambda: [draw(motion) for motion in _smooth_motion(n_frames, 8, rng)], camera)
+        surfaces = facing_draws(lambda: [draw(motion) for motion in smooth_motion(n_frames, 8, rng)], camera)
     return Scene.of(surfaces, camera)
 
 
@@ -98,11 +91,11 @@ def moebius(
         seed: of points, sheet and maps.
     """
     rng = np.random.default_rng(seed)
-    s, t = _sheet(n_points, rng)
+    s, t = flat_sheet(n_points, rng)
     waves = [(rng.uniform(-2.5, 2.5, 2), rng.uniform(0.0, 2 * np.pi)) for _ in range(3)]
     relief = sum(((s * k[0] + t * k[1] + phase).sin() * 0.08 for k, phase in waves), start=0.0 * s)
     sheet = Jet.stack([s, t, relief])
-    return Scene.of([_facing_draw(lambda: _moebius_image(sheet, scale_ratio, rng)) for _ in range(n_frames)])
+    return Scene.of([facing_draw(lambda: _moebius_image(sheet, scale_ratio, rng)) for _ in range(n_frames)])
 
 
 def mixed(
@@ -111,32 +104,15 @@ def mixed(
     """Even frames: isometric bendings of one sheet. Odd frames: Moebius images of such bendings (the paper's second
     data set mixes isometric and conformal deformations likewise). Arguments as in `isometric_bending` and `moebius`."""
     rng = np.random.default_rng(seed)
-    sheet = _sheet(n_points, rng)
+    sheet = flat_sheet(n_points, rng)
 
     def draw(frame: int) -> Jet:
-        rolled = _rolled(sheet, rng.uniform(-0.8, 0.8), rng.uniform(-np.pi, np.pi))
+        bent = rolled(sheet, rng.uniform(-0.8, 0.8), rng.uniform(-np.pi, np.pi))
         if frame % 2 == 0:
-            return _placed(rolled, rng.uniform(-1.0, 1.0, 6), tilt_deg=25.0, fill=(0.75, 1.0))
-        return _moebius_image(rolled, scale_ratio, rng)
+            return placed(bent, rng.uniform(-1.0, 1.0, 6), tilt_deg=25.0, fill=(0.75, 1.0))
+        return _moebius_image(bent, scale_ratio, rng)
 
-    return Scene.of([_facing_draw(partial(draw, f)) for f in range(n_frames)])
-
-
-def _sheet(n_points: int, rng: np.random.Generator) -> tuple[Jet, Jet]:
-    """Random points of the flat sheet."""
-    s, t = (rng.uniform(-1.0, 1.0, (n_points, 2)) * SHEET).T
-    return Jet.variables(s, t)
-
-
-def _rolled(sheet: tuple[Jet, Jet], curvature: float, axis: float) -> Jet:
-    """The sheet rolled to a cylinder: isometric. `axis` is the direction of rolling in the sheet, in radians."""
-    curvature = curvature if abs(curvature) > 1e-6 else 1e-6  # flat to within the rounding of the formulas
-    s, t = sheet
-    along = s * np.cos(axis) + t * np.sin(axis)
-    across = t * np.cos(axis) - s * np.sin(axis)
-    sagitta = (along * (0.5 * curvature)).sin()
-    rolled = Jet.stack([(along * curvature).sin() / curvature, across, sagitta * sagitta * (2.0 / curvature)])
-    return rolled.rotated(Rotation.from_rotvec([0.0, 0.0, axis]).as_matrix())
+    return Scene.of([facing_draw(partial(draw, f)) for f in range(n_frames)])
 
 
 def _moebius_image(surface: Jet, scale_ratio: tuple[float, float], rng: np.random.Generator) -> Jet:
@@ -147,7 +123,7 @@ def _moebius_image(surface: Jet, scale_ratio: tuple[float, float], rng: np.rando
     image = image * (1.0 / np.linalg.norm(image.value - image.value.mean(axis=1, keepdims=True), axis=0).max())
     inward = inward_normal(image).mean(axis=1)
     upright, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], [inward])
-    return _placed(image.rotated(upright.as_matrix()), rng.uniform(-1.0, 1.0, 6), tilt_deg=25.0, fill=(0.75, 1.0))
+    return placed(image.rotated(upright.as_matrix()), rng.uniform(-1.0, 1.0, 6), tilt_deg=25.0, fill=(0.75, 1.0))
 
 
 def _inversion_centre(x: np.ndarray, scale_ratio: float, rng: np.random.Generator) -> np.ndarray:
@@ -167,42 +143,3 @@ def _inversion_centre(x: np.ndarray, scale_ratio: float, rng: np.random.Generato
         # Seen along its normal a sheet is about equally far everywhere: not every direction allows every ratio.
         if excess(1.01 * radius) > 0:
             return middle + direction * brentq(excess, 1.01 * radius, 1000.0 * radius)
-
-
-def _placed(surface: Jet, motion: np.ndarray, tilt_deg: float, fill: tuple[float, float]) -> Jet:
-    """The surface turned and moved in front of the camera: spin (up to 60 degrees), tilt, lateral shift, distance.
-
-    Args:
-        surface: facing the camera, any place.
-        motion: (6,) numbers in [-1, 1].
-        tilt_deg: largest tilt about either image axis.
-        fill: range of the share of the field of view that the surface fills, which sets its distance.
-    """
-    tilt = np.radians(tilt_deg) * motion[:2]
-    turn = Rotation.from_rotvec([*tilt, 0.0]) * Rotation.from_rotvec([0.0, 0.0, np.radians(60.0) * motion[2]])
-    turned = (surface - surface.value.mean(axis=1)[:, None]).rotated(turn.as_matrix())
-    shift = 0.2 * motion[3:5] * np.linalg.norm(turned.value, axis=0).max()
-    half = HALF_FIELD * np.interp(motion[5], (-1.0, 1.0), fill)
-    x, y, z = turned.value
-    distance = np.maximum(np.abs(x + shift[0]) / half[0], np.abs(y + shift[1]) / half[1]) - z
-    return turned + np.array([*shift, distance.max()])[:, None]
-
-
-def _smooth_motion(n_frames: int, n_series: int, rng: np.random.Generator) -> np.ndarray:
-    """(F, n_series) random sums of three slow waves, each series within [-1, 1]."""
-    time = np.arange(n_frames)[:, None, None] / max(n_frames, 2)
-    wave = np.sin(2 * np.pi * (rng.uniform(0.25, 1.0, (n_series, 3)) * time + rng.uniform(0.0, 1.0, (n_series, 3))))
-    return (wave * rng.dirichlet(np.ones(3), n_series)).sum(axis=-1)
-
-
-def _facing_draw(draw: Callable[[], Jet], camera: Camera = PERSPECTIVE) -> Jet:
-    return _facing_draws(lambda: [draw()], camera)[0]
-
-
-def _facing_draws(draw: Callable[[], list[Jet]], camera: Camera) -> list[Jet]:
-    """Draw until every surface faces the camera everywhere."""
-    for _ in range(1000):
-        surfaces = draw()
-        if all(facing(surface, camera).min() > LEAST_FACING for surface in surfaces):
-            return surfaces
-    raise InputError("no frame of the synthetic scene faces the camera everywhere; ask for a flatter surface")

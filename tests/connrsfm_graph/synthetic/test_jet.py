@@ -14,6 +14,7 @@ FORMULAS: dict[str, Callable[[Jet, Jet], Jet]] = {
     "power": lambda s, t: (s * s + t + 3.0) ** 0.5,
     "logarithm": lambda s, t: (s * t + 4.0).log(),
     "sine": lambda s, t: (s * 2.0 - t * t).sin(),
+    "arc tangent": lambda s, t: (s * 2.0 - t * t).arctan(),
     "norm": lambda s, t: Jet.stack([s, t * s, t + 2.0]).squared_norm(),
     "rotation": lambda s, t: Jet.stack([s * s, t * s, t]).rotated(np.roll(np.eye(3), 1, axis=0))[0],
 }
