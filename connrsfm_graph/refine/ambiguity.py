@@ -19,9 +19,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from connrsfm_graph.refine.curvature import shear_kernel
+from connrsfm_graph.refine.measurements import Shape
 from connrsfm_graph.refine.mesh import Mesh
 from connrsfm_graph.refine.restarts import inverted
-from connrsfm_graph.refine.solve import Shape
 from connrsfm_graph.threads import over_views
 
 _ISOMETRIC = 0.005

@@ -22,7 +22,8 @@ class RefineConfig:
     """Views known to be isometric to each other (at least two), for the conformal model: their common metric fixes what
     conformal invariance alone cannot tell."""
     length_sigma: float = 0.01
-    """Standard deviation of a log edge length in one view: what the surface stretches, and the mesh does not show."""
+    """Standard deviation of a log edge length in one view: what the surface stretches, and the mesh does not show.
+    Where the tracks are noisy it is where a smaller one is looked for, as far as that predicts points left out."""
     factor_sigma: float = 0.2
     """Standard deviation of the difference of log conformal factor between neighbours, for the conformal model."""
     rings: int = 2

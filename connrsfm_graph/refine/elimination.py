@@ -173,6 +173,12 @@ class Factorised:
         views, lengths = self.solve(self.equations.gradient[None], self.equations.length_gradient[None], tolerance)
         return views[0], lengths[0]
 
+    def correction(self, residual: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+        """Step against length residuals (F, E) that a step has left beyond what its linearisation says."""
+        lengths = -(self.equations.weight * residual).sum(axis=0)
+        views, lengths = self.solve(-self.spread(residual[None]), lengths[None], tolerance)
+        return views[0], lengths[0]
+
     def solve(
         self, gradient: np.ndarray, length_gradient: np.ndarray, tolerance: float
     ) -> tuple[np.ndarray, np.ndarray]:

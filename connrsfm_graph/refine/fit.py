@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 
 from connrsfm_graph.refine.ambiguity import resolve
+from connrsfm_graph.refine.measurements import Measurements, Shape, costs, lag
 from connrsfm_graph.refine.noise import Noise
 from connrsfm_graph.refine.reseat import reseat
 from connrsfm_graph.refine.restarts import inverted, restart
-from connrsfm_graph.refine.settle import BEYOND_DOUBT, noise_evidence, settled
+from connrsfm_graph.refine.settle import BEYOND_DOUBT, noise_evidence, settled, trusting_lengths
 from connrsfm_graph.refine.slant import seen_frontally
-from connrsfm_graph.refine.solve import Measurements, Shape, costs, lag
 from connrsfm_graph.refine.start import start_shape
 from connrsfm_graph.refine.task import Fit, Task, minimised
 
@@ -45,13 +45,13 @@ def fit(task: Task, sigma_image: float) -> Fit:
     misfit = isometric.misfit()
     isometric.evidence["isometric misfit"] = misfit
     if wanted == "isometric" or misfit <= _MISFIT:
-        return _seen_frontally(task, isometric)
+        return _finished(task, isometric)
     conformal = fit_conformal(task, noise)
     ratio = isometric.first_cost / max(conformal.first_cost, 1e-300)
     for found in (isometric, conformal):
         found.evidence["isometric misfit"] = misfit
         found.evidence["isometric over conformal cost"] = ratio
-    return conformal if ratio > _RATIO else _seen_frontally(task, isometric)
+    return conformal if ratio > _RATIO else _finished(task, isometric)
 
 
 def fit_isometric(task: Task, noise: Noise) -> Fit:
@@ -74,9 +74,9 @@ def fit_isometric(task: Task, noise: Noise) -> Fit:
     return replace(_restarted_where_dear(task, found), first_cost=found.first_cost)
 
 
-def _seen_frontally(task: Task, isometric: Fit) -> Fit:
-    """The isometric fit that is taken, with the prior on slants that the data ask for."""
-    found = seen_frontally(task, isometric)
+def _finished(task: Task, isometric: Fit) -> Fit:
+    """The isometric fit that is taken, with the prior on slants and the trust in lengths that the data ask for."""
+    found = trusting_lengths(task, seen_frontally(task, isometric))
     found.evidence.update(noise_evidence(task, found))
     return found
 
@@ -153,7 +153,8 @@ def fit_conformal(task: Task, noise: Noise) -> Fit:
         if np.count_nonzero(ambiguity.group == 1) > 1 and other[-1] < history[-1]:
             shape, alternative = alternative, shape
             history += other
-    found = settled(task, Fit(measurements, shape, noise, history, history[-1]))
+    found = trusting_lengths(task, settled(task, Fit(measurements, shape, noise, history, history[-1])))
+    found.evidence.update(noise_evidence(task, found))
     found.evidence["conformal factors rest on"] = ambiguity.assumption
     found.evidence["views that might be inverted"] = np.flatnonzero(ambiguity.group).tolist()
     return replace(found, ambiguity=ambiguity, alternative=alternative)

@@ -12,10 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from connrsfm_graph.refine.config import RefineConfig
+from connrsfm_graph.refine.measurements import Measurements, Shape, costs, lag
 from connrsfm_graph.refine.reseat import reseat
 from connrsfm_graph.refine.resection import moved_rigidly
 from connrsfm_graph.refine.restarts import inverted, restart
-from connrsfm_graph.refine.solve import Measurements, Shape, costs, fit_views, lag
+from connrsfm_graph.refine.solve import fit_views
 from connrsfm_graph.refine.task import Fit
 from connrsfm_graph.refine.uncertainty import log_depth_deviation
 from connrsfm_graph.refine.unseen import Template, complete_images

@@ -11,7 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from connrsfm_graph.refine.solve import Measurements, Shape, minimise
+from connrsfm_graph.refine.measurements import Measurements, Shape
+from connrsfm_graph.refine.solve import minimise
 
 _PARTS, _USED, _ENOUGH = 5, 3, 1000
 """Observations are dealt out at random to so many parts, of which so many are left out in turn, fewer if those hold
@@ -19,7 +20,8 @@ enough observations."""
 _LEFT_OUT = 1e-2
 """Factor on the weight of an image point that is left out: enough to keep it where nothing else holds it."""
 _ITERATIONS = 8
-"""Of every fit, the same number for all that are compared."""
+"""Of every fit, the same number for all that are compared. They are close ones: a fit that has not yet forgotten a
+point predicts it too well, and the better the tighter its lengths are held."""
 _SIGNIFICANT = 2.0
 """Standard errors by which the errors' mean must differ."""
 _GROSS = 9.0
@@ -39,7 +41,7 @@ def prediction_errors(measurements: Measurements, shape: Shape, seen: np.ndarray
     for number in range(_USED):
         left_out = part == number
         weight = np.where(left_out, _LEFT_OUT, 1.0) * measurements.image_weight
-        fitted, _ = minimise(replace(measurements, image_weight=weight), shape, _ITERATIONS, 0.0)
+        fitted, _ = minimise(replace(measurements, image_weight=weight), shape, _ITERATIONS, 0.0, closely=True)
         errors.append((fitted.correction[left_out] ** 2).sum(axis=-1))
         if sum(map(len, errors)) >= _ENOUGH:
             break

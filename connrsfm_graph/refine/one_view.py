@@ -31,7 +31,7 @@ def fit_views_kernel(
     """Fit views first to last - 1.
 
     Args:
-        image, image_weight, length_weight, factor_weight: as in `solve.Measurements`.
+        image, image_weight, length_weight, factor_weight: as in `measurements.Measurements`.
         anchor: (F, P) log depths about which those of the shape may drift.
         triangles: (T, 3) of the mesh.
         terms: what all views share.

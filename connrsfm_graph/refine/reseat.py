@@ -11,7 +11,8 @@ from dataclasses import replace
 import numpy as np
 from scipy import sparse
 
-from connrsfm_graph.refine.solve import Measurements, Shape, costs, fit_views, lag
+from connrsfm_graph.refine.measurements import Measurements, Shape, costs, lag
+from connrsfm_graph.refine.solve import fit_views
 
 _STEPS = np.linspace(-0.3, 0.3, 61)
 """Changes of log depth that are tried."""

@@ -17,8 +17,9 @@ from itertools import chain
 
 import numpy as np
 
+from connrsfm_graph.refine.measurements import Measurements, Shape, costs, lag
 from connrsfm_graph.refine.resection import moved_rigidly
-from connrsfm_graph.refine.solve import Measurements, Shape, costs, fit_views, lag
+from connrsfm_graph.refine.solve import fit_views
 from connrsfm_graph.refine.start import log_chords
 
 _ITERATIONS = 25

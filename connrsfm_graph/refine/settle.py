@@ -15,20 +15,20 @@ BEYOND_DOUBT = 0.05
 """A fit that leaves less than this is right, whatever its ray corrections look like."""
 _ROUNDS = 3
 """Fits with noise levels that the one before has shown, at most."""
-_HALVINGS = 2
-"""How often the assumed length noise may be halved."""
+_IN_VAIN = 2
+"""So often the assumed length noise is halved without points left out being predicted better: what one halving does not
+show the next may."""
+_LEAST = 0.005
+"""It is never taken for less than this part of what it was assumed to be at first."""
 
 
 def settled(task: Task, found: Fit) -> Fit:
     """The fit with the noise levels that the data show.
 
-    Where the ray corrections look like noise, the image noise stands and the lengths are trusted more, if that predicts
-    image points better. Where they do not, the image noise was assumed too large, as long as that leaves the
-    shared lengths where they are: what little noise is left would else crumple all views alike.
+    Where the ray corrections look like noise, the image noise stands. Where they do not, it was assumed too large, as
+    long as that leaves the shared lengths where they are: what little noise is left would else crumple all views alike.
     """
     noisy = found.looks_like_noise(task)
-    if noisy:
-        found = _trusting_lengths(task, found)
     for _ in range(_ROUNDS):
         noise = found.noise.after_fit(found.residuals())
         if not noisy:
@@ -45,17 +45,22 @@ def settled(task: Task, found: Fit) -> Fit:
     return replace(found, noisy=noisy)
 
 
-def _trusting_lengths(task: Task, found: Fit) -> Fit:
-    """The fit with half the length noise, or a quarter, where points left out are predicted better."""
-    if found.misfit() < BEYOND_DOUBT:
+def trusting_lengths(task: Task, found: Fit) -> Fit:
+    """A settled fit with half the length noise, again and again while points left out are predicted better.
+
+    That tells what keeps its lengths, as paper does, from what stretches a little. Only noise of the image points asks
+    for it, and slants are settled before: while lengths are held tightly they hardly move.
+    """
+    if not found.noisy or found.misfit() < BEYOND_DOUBT:
         return found
     errors = prediction_errors(found.measurements, found.shape, task.seen)
-    trial = found
-    for _ in range(_HALVINGS):
+    trial, in_vain = found, 0
+    while in_vain < _IN_VAIN and trial.noise.length > _LEAST * task.config.length_sigma:
         trial = refitted(task, trial, trial.noise.halved_length())
         new = prediction_errors(trial.measurements, trial.shape, task.seen)
+        in_vain += 1
         if predicts_better(new, errors):
-            found, errors = trial, new
+            found, errors, in_vain = trial, new, 0
     return found
 
 

@@ -2,226 +2,63 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from connrsfm_graph.errors import ComputationError
-from connrsfm_graph.refine.cost import Terms, Weights, cost_kernel, hinge_stencils, linearise_kernel
-from connrsfm_graph.refine.curvature import arc_offset_kernel
-from connrsfm_graph.refine.elimination import Factorised, NormalEquations
-from connrsfm_graph.refine.envelope import Envelope, make_envelope
-from connrsfm_graph.refine.mesh import Mesh
+from connrsfm_graph.refine.elimination import Factorised
+from connrsfm_graph.refine.measurements import (
+    OF_VIEWS,
+    Measurements,
+    Shape,
+    lag,
+    linearise,
+    moved,
+    stencils_of,
+    terms_of,
+    total_cost,
+)
 from connrsfm_graph.refine.one_view import fit_views_kernel
 from connrsfm_graph.threads import over_views
 
-Progress = Callable[[str], None]
-
 _DAMPING = (1e-3, 1e-7, 1e6)
 """First, smallest and largest damping."""
+_CLOSE_DAMPING = 1e-6
+"""First one of close steps."""
 _EXACT = 1e-6
 """Mean squared length residual, in assumed variances, below which the data are exact and nothing is left to gain."""
 _INNER_TOLERANCE = 0.2
 """Relative accuracy of the conjugate gradients: what they leave the next iteration corrects, as it does curvature."""
-_OF_VIEWS = ("log_depth", "correction", "log_factor")
-"""Parts of a shape that belong to single views."""
+_CLOSE_TOLERANCE = 0.1
+"""That of close steps."""
+_COINCIDENT = 1e-300
+"""Squared chords are at least so long, as in the factors."""
 
 
-@dataclass(frozen=True)
-class Shape:
-    """What is estimated."""
-
-    log_depth: np.ndarray
-    """(F, P)."""
-    correction: np.ndarray
-    """(F, P, 2) corrections of the sight rays, normalised coordinates."""
-    log_factor: np.ndarray
-    """(F, P) log conformal factors; (F, 0) in an isometric model."""
-    log_length: np.ndarray
-    """(E,) lengths shared by all views."""
-
-    def points(self, image: np.ndarray) -> np.ndarray:
-        """(F, P, 3) points in the camera frames, for tracked image points (F, P, 2)."""
-        depth = np.exp(self.log_depth)[..., None]
-        return np.concatenate([depth * (image + self.correction), depth], axis=-1)
-
-    def views(self, index: np.ndarray) -> Shape:
-        """The shape of some views."""
-        return Shape(self.log_depth[index], self.correction[index], self.log_factor[index], self.log_length)
-
-    def replaced(self, index: np.ndarray, other: Shape) -> Shape:
-        """The shape with some views taken from a shape of only these."""
-        parts = {name: getattr(self, name).copy() for name in _OF_VIEWS}
-        for name, part in parts.items():
-            part[index] = getattr(other, name)
-        return replace(self, **parts)
-
-
-@dataclass(frozen=True)
-class Measurements:
-    """What the shape is compared with."""
-
-    image: np.ndarray
-    """(F, P, 2) image points, normalised coordinates; finite everywhere, interpolated where not seen."""
-    image_weight: np.ndarray
-    """(F, P) inverse standard deviation of the image points."""
-    log_depth: np.ndarray
-    """(F, P) log depths of the start, about which those of the shape may drift."""
-    log_length: np.ndarray
-    """(E,) log lengths of the start, likewise; it keeps a part that hardly moves from coming off the surface."""
-    log_length_weight: np.ndarray
-    """(E,) their inverse standard deviation."""
-    length_weight: np.ndarray
-    """(F, E) inverse standard deviation of the log lengths."""
-    factor_weight: np.ndarray
-    """(F,) inverse standard deviation of the log conformal factors of a view; not used in an isometric model."""
-    mesh: Mesh
-    """Edges and hinges."""
-    weights: Weights
-    """Inverse standard deviations of the other terms."""
-
-    def envelope(self, conformal: bool) -> Envelope:
-        """Storage of the views' matrices."""
-        return make_envelope(self.mesh.order(), [self.mesh.edges, self.mesh.hinges], 4 if conformal else 3)
-
-    def views(self, index: np.ndarray) -> Measurements:
-        """The measurements of some views."""
-        return replace(
-            self,
-            image=self.image[index],
-            image_weight=self.image_weight[index],
-            log_depth=self.log_depth[index],
-            length_weight=self.length_weight[index],
-            factor_weight=self.factor_weight[index],
-        )
-
-    def replaced(self, index: np.ndarray, other: Measurements) -> Measurements:
-        """The measurements with some views taken from measurements of only these."""
-        names = ("image", "image_weight", "log_depth", "length_weight", "factor_weight")
-        parts = {name: getattr(self, name).copy() for name in names}
-        for name, part in parts.items():
-            part[index] = getattr(other, name)
-        return replace(self, **parts)
-
-
-@dataclass(frozen=True)
-class Lagged:
-    """Functions of the shape that are held fixed in its derivatives."""
-
-    offset: np.ndarray
-    """(F, E) log ratio of arc to chord."""
-    stencils: np.ndarray
-    """(H, 4) coefficients of the hinges."""
-
-
-def lag(measurements: Measurements, shape: Shape) -> Lagged:
-    """Hinge coefficients and arc offsets at a shape.
-
-    A conformal model compares chords: Moebius maps keep their ratios exactly, not those of arcs.
-    """
-    mesh, stencils = measurements.mesh, _stencils(measurements, shape)
-    points = shape.points(measurements.image)
-    offset = np.zeros((len(points), len(mesh.edges)))
-    if shape.log_factor.size:
-        return Lagged(offset, stencils)
-    over_views(arc_offset_kernel, len(points), points, mesh.triangles, mesh.edges, offset)
-    return Lagged(offset, stencils)
-
-
-def _stencils(measurements: Measurements, shape: Shape) -> np.ndarray:
-    stencils = np.zeros((len(measurements.mesh.hinges), 4))
-    if measurements.weights.bending > 0.0:
-        hinge_stencils(np.exp(shape.log_length), measurements.mesh.hinge_edges, stencils)
-    return stencils
-
-
-def costs(measurements: Measurements, shape: Shape, lagged: Lagged) -> np.ndarray:
-    """(F,) cost of every view, see `view_cost`."""
-    cost = np.empty(len(shape.log_depth))
-    over_views(cost_kernel, len(cost), *kernel_arguments(measurements, shape, lagged), cost)
-    return cost
-
-
-def linearise(
-    measurements: Measurements,
-    shape: Shape,
-    lagged: Lagged,
-    envelope: Envelope,
-    storage: np.ndarray | None = None,
-) -> tuple[NormalEquations, np.ndarray]:
-    """Normal equations at a shape, and the length residuals (F, E); `storage` is that of a matrix no longer needed."""
-    F, _ = shape.log_depth.shape
-    n, E = len(envelope.first), len(measurements.mesh.edges)
-    matrix = np.empty((F, envelope.start[-1])) if storage is None else storage
-    gradient = np.empty((F, n))
-    border = np.empty((F, E, 8 if shape.log_factor.size else 6))
-    residual, weight = np.empty((F, E)), np.empty((F, E))
-    arguments = kernel_arguments(measurements, shape, lagged)
-    over_views(linearise_kernel, F, *arguments, envelope, matrix, gradient, border, residual, weight)
-    unit, frontal = measurements.weights.unit, measurements.weights.frontal
-    prior = measurements.log_length_weight**2
-    equations = NormalEquations(
-        matrix=matrix,
-        gradient=gradient,
-        border=border,
-        weight=weight,
-        unit=unit,
-        length_weight=prior,
-        length_gradient=unit**2 * shape.log_length.mean() / E
-        + F * frontal
-        + prior * (shape.log_length - measurements.log_length)
-        - (weight * residual).sum(axis=0),
-    )
-    return equations, residual
-
-
-def kernel_arguments(measurements: Measurements, shape: Shape, lagged: Lagged) -> tuple:
-    """What the kernels of the cost ask for."""
-    return (
-        shape.points(measurements.image),
-        shape.log_factor,
-        shape.log_depth - measurements.log_depth,
-        lagged.offset,
-        shape.correction,
-        measurements.image_weight,
-        measurements.length_weight,
-        measurements.factor_weight,
-        _terms(measurements, shape, lagged.stencils),
-    )
-
-
-def _terms(measurements: Measurements, shape: Shape, stencils: np.ndarray) -> Terms:
-    mesh = measurements.mesh
-    return Terms(mesh.edges, mesh.n_near, mesh.hinges, stencils, shape.log_length, measurements.weights)
-
-
-def moved(shape: Shape, envelope: Envelope, views: np.ndarray, lengths: np.ndarray | float) -> Shape:
-    """The shape after a step: (F, n) of the views' unknowns and (E,) of the lengths."""
-    F, P = shape.log_depth.shape
-    step = views.reshape(F, P, -1)[:, envelope.unknown // (views.shape[1] // P)]
-    return Shape(
-        log_depth=shape.log_depth + step[..., 0],
-        correction=shape.correction + step[..., 1:3],
-        log_factor=shape.log_factor + step[..., 3] if shape.log_factor.size else shape.log_factor,
-        log_length=shape.log_length + lengths,
-    )
-
-
-def minimise(measurements: Measurements, shape: Shape, iterations: int, tolerance: float) -> tuple[Shape, list[float]]:
+def minimise(
+    measurements: Measurements, shape: Shape, iterations: int, tolerance: float, closely: bool = False
+) -> tuple[Shape, list[float]]:
     """All views and the lengths together.
+
+    Where tracks tell little the cost has bent valleys, along which straight and roughly solved steps descend slowly:
+    good enough for a surface, too slow for fits that are to be compared.
 
     Args:
         measurements: image points, mesh and weights.
-        shape: start.
+        shape: start, which close steps ask to be near a minimum: from afar they lead to others.
         iterations: at most so many.
         tolerance: stop where an iteration lowers the cost by less than this part.
+        closely: whether steps are solved closely, hardly damped at first, and bent where straight ones are refused.
 
     Returns:
         The shape and the cost at the start and after every iteration.
     """
     envelope = measurements.envelope(shape.log_factor.size > 0)
     damping, smallest, largest = _DAMPING
+    inner = _INNER_TOLERANCE
+    if closely:
+        damping, inner = _CLOSE_DAMPING, _CLOSE_TOLERANCE
     lagged = lag(measurements, shape)
     history = [total_cost(measurements, shape, lagged)]
     storage = None
@@ -232,8 +69,12 @@ def minimise(measurements: Measurements, shape: Shape, iterations: int, toleranc
             storage = equations.matrix
             try:
                 factorised = Factorised(equations, envelope, measurements.mesh.edges, damping)
-                trial = moved(shape, envelope, *factorised.step(_INNER_TOLERANCE))
+                trial = moved(shape, envelope, *factorised.step(inner))
                 after = total_cost(measurements, trial, lagged)
+                if closely and before < after < np.inf:
+                    missed = _missed(measurements, shape, trial, equations.border)
+                    trial = moved(trial, envelope, *factorised.correction(missed, inner))
+                    after = total_cost(measurements, trial, lagged)
             except ComputationError:
                 after = np.inf
             if after <= before:
@@ -250,6 +91,21 @@ def minimise(measurements: Measurements, shape: Shape, iterations: int, toleranc
     return shape, history
 
 
+def _missed(measurements: Measurements, shape: Shape, trial: Shape, border: np.ndarray) -> np.ndarray:
+    """(F, E) by how much log chords change more than their derivatives at a shape say."""
+    i, k = measurements.mesh.edges.T
+    chords = []
+    for each in (shape, trial):
+        points = each.points(measurements.image)
+        chords.append(np.log(np.linalg.norm(points[:, i] - points[:, k], axis=-1)))
+    step = np.concatenate(
+        [(trial.log_depth - shape.log_depth)[..., None], trial.correction - shape.correction], axis=-1
+    )
+    m = border.shape[-1] // 2
+    linear = (border[..., :3] * step[:, i]).sum(axis=-1) + (border[..., m : m + 3] * step[:, k]).sum(axis=-1)
+    return np.asarray(chords[1] - chords[0] - linear)
+
+
 def fit_views(measurements: Measurements, shape: Shape, iterations: int, tolerance: float) -> tuple[Shape, np.ndarray]:
     """Each view on its own, lengths held, until an iteration lowers its cost by less than `tolerance` of it.
 
@@ -257,7 +113,7 @@ def fit_views(measurements: Measurements, shape: Shape, iterations: int, toleran
         The shape and the (F,) costs.
     """
     envelope = measurements.envelope(shape.log_factor.size > 0)
-    mesh, found = measurements.mesh, replace(shape, **{name: getattr(shape, name).copy() for name in _OF_VIEWS})
+    mesh, found = measurements.mesh, replace(shape, **{name: getattr(shape, name).copy() for name in OF_VIEWS})
     cost = np.empty(len(shape.log_depth))
     over_views(
         fit_views_kernel,
@@ -268,7 +124,7 @@ def fit_views(measurements: Measurements, shape: Shape, iterations: int, toleran
         measurements.length_weight,
         measurements.factor_weight,
         mesh.triangles,
-        _terms(measurements, shape, _stencils(measurements, shape)),
+        terms_of(measurements, shape, stencils_of(measurements, shape)),
         envelope,
         iterations,
         tolerance,
@@ -280,11 +136,3 @@ def fit_views(measurements: Measurements, shape: Shape, iterations: int, toleran
         cost,
     )
     return found, cost
-
-
-def total_cost(measurements: Measurements, shape: Shape, lagged: Lagged) -> float:
-    """Cost of all views, and of the lengths' own priors."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        total = float(costs(measurements, shape, lagged).sum())
-    drift = measurements.log_length_weight * (shape.log_length - measurements.log_length)
-    return total + 0.5 * (measurements.weights.unit * float(shape.log_length.mean())) ** 2 + 0.5 * float(drift @ drift)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from connrsfm_graph.refine.measurements import Shape
 from connrsfm_graph.refine.mesh import Mesh, surface_mesh
-from connrsfm_graph.refine.solve import Shape
 from connrsfm_graph.refine.unseen import Completed
 from factors.surface import PERSPECTIVE
 

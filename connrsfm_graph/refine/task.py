@@ -10,9 +10,10 @@ import numpy as np
 from connrsfm_graph.refine.ambiguity import Ambiguity
 from connrsfm_graph.refine.config import RefineConfig
 from connrsfm_graph.refine.cost import Weights
+from connrsfm_graph.refine.measurements import Measurements, Shape, lag, linearise
 from connrsfm_graph.refine.mesh import Mesh
 from connrsfm_graph.refine.noise import Noise, neighbour_correlation
-from connrsfm_graph.refine.solve import Measurements, Shape, lag, linearise, minimise
+from connrsfm_graph.refine.solve import minimise
 from connrsfm_graph.refine.start import start_mesh, start_shape
 from connrsfm_graph.refine.unseen import Completed
 from factors.frontal import PER_PATCH

@@ -10,6 +10,7 @@ tilts surfaces much more than independent noise of the same size.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import islice
 
 import numpy as np
@@ -18,8 +19,8 @@ from numba import njit
 from connrsfm_graph.refine.cost import linearise_view
 from connrsfm_graph.refine.elimination import Factorised, spread_view
 from connrsfm_graph.refine.envelope import factor_damped, substitute
+from connrsfm_graph.refine.measurements import Measurements, Shape, kernel_arguments, lag, linearise
 from connrsfm_graph.refine.mesh import Mesh
-from connrsfm_graph.refine.solve import Measurements, Shape, kernel_arguments, lag, linearise
 from connrsfm_graph.threads import over_views
 
 _SAMPLES = 20
@@ -27,6 +28,9 @@ _AT_ONCE = 5
 """Samples that are solved together."""
 _TOLERANCE = 0.03
 """Relative accuracy of the linear solutions, well below that of a deviation from so few draws."""
+_SUREST = 0.0025
+"""Standard deviation of a log length, at least: a fit may hold them tighter, but chords of a mesh are not arcs, and
+such a fit is never quite at its minimum."""
 _SMOOTHINGS = 4
 """Averages over neighbours that make independent noise a stretch of the surface."""
 
@@ -42,7 +46,7 @@ def log_depth_deviation(
     """(F, P) standard deviation of log depth, the scale common to all views left out.
 
     Args:
-        measurements: with the noise levels of the fit.
+        measurements: with the noise levels of the fit; lengths held tighter than to 0.0025 count as held to that.
         shape: minimum of the cost.
         stretch: whether lengths vary alike for neighbours.
         jointly: whether the views were fitted together with the lengths. Else the lengths are taken as known, views do
@@ -51,6 +55,8 @@ def log_depth_deviation(
             fitted together only.
         seed: of the draws.
     """
+    length_weight = np.minimum(measurements.length_weight, 1.0 / _SUREST)
+    measurements = replace(measurements, length_weight=length_weight)
     draws = _draws(np.random.default_rng(seed), len(shape.log_depth) if jointly else 1, measurements.mesh, stretch)
     if jointly:
         variance = _variance_of_all(measurements, shape, draws, about_mean)

@@ -15,8 +15,9 @@ from connrsfm_graph.initialise import with_closed_form_scale
 from connrsfm_graph.integrate import integrate
 from connrsfm_graph.problem import Problem, State, flat_state, make_problem
 from connrsfm_graph.refine.cost import Weights
+from connrsfm_graph.refine.measurements import Measurements, Shape
 from connrsfm_graph.refine.mesh import surface_mesh
-from connrsfm_graph.refine.solve import Measurements, Shape, fit_views
+from connrsfm_graph.refine.solve import fit_views
 from connrsfm_graph.refine.start import log_chords
 from connrsfm_graph.refine.thin_plate import fit_thin_plate
 from connrsfm_graph.refine.uncertainty import log_depth_deviation

@@ -7,8 +7,8 @@ import pytest
 
 from connrsfm_graph.refine.ambiguity import consensus, resolve, shear_correlation
 from connrsfm_graph.refine.cost import Weights
+from connrsfm_graph.refine.measurements import Measurements, Shape, costs, lag
 from connrsfm_graph.refine.restarts import inverted
-from connrsfm_graph.refine.solve import Measurements, Shape, costs, lag
 from connrsfm_graph.refine.start import log_chords, start_mesh
 from connrsfm_graph.refine.unseen import complete
 from connrsfm_graph.synthetic import Scene, isometric_bending, mixed, moebius

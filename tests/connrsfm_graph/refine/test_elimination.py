@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 
 from connrsfm_graph.errors import ComputationError
+from connrsfm_graph.refine import solve
 from connrsfm_graph.refine.cost import Weights
 from connrsfm_graph.refine.elimination import Factorised
+from connrsfm_graph.refine.measurements import Measurements, Shape, costs, lag, linearise, moved, total_cost
 from connrsfm_graph.refine.mesh import surface_mesh
-from connrsfm_graph.refine.solve import Measurements, Shape, costs, fit_views, lag, linearise, moved, total_cost
+from connrsfm_graph.refine.solve import fit_views
 from factors.adapter import make_factor
 from factors.bending import Bending
 from factors.edge_length import edge_length_factor
@@ -49,7 +51,11 @@ def _random_problem(conformal: bool, bending: bool, seed: int = 0, frontal: floa
     return measurements, shape
 
 
-def _graph(measurements: Measurements, shape: Shape) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+def _graph(
+    measurements: Measurements, shape: Shape, more: np.ndarray | float = 0.0
+) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    """All factors; the residuals of lengths `more` (F, E) than they are."""
+    more = np.broadcast_to(more, (F, len(shape.log_length)))
     mesh, weights, lagged = measurements.mesh, measurements.weights, lag(measurements, shape)
     conformal = shape.log_factor.size > 0
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -79,7 +85,7 @@ def _graph(measurements: Measurements, shape: Shape) -> tuple[gtsam.NonlinearFac
                 graph.add(gtsam.PriorFactorVector(key(LOG_FACTOR, i, j), np.zeros(1), sigma(1, weight)))
         for e, (i, k) in enumerate(mesh.edges):
             noise = gtsam.noiseModel.Robust.Create(loss, sigma(1, measurements.length_weight[j, e]))
-            offset = lagged.offset[j, e]
+            offset = lagged.offset[j, e] + more[j, e]
             graph.add(edge_length_factor(e, i, k, j, image[i], image[k], noise, offset, conformal))
             graph.add(frontal_factor(e, i, k, j, image[i], image[k], weights.frontal))
             if conformal and e < mesh.n_near:
@@ -112,6 +118,44 @@ def test_cost_and_step_equal_gtsams(conformal, bending, frontal):
                 assert ours.log_factor[j, i] == pytest.approx(theirs.atVector(key(LOG_FACTOR, i, j))[0], abs=1e-10)
     for e in range(len(shape.log_length)):
         assert ours.log_length[e] == pytest.approx(theirs.atVector(key(LOG_LENGTH, e))[0], abs=1e-10)
+
+
+@pytest.mark.parametrize("conformal", [False, True])
+def test_a_correction_is_by_what_gtsams_step_changes(conformal):
+    measurements, shape = _random_problem(conformal, bending=True)
+    measurements = replace(measurements, weights=measurements.weights._replace(huber=1e9))
+    missed = np.random.default_rng(1).normal(0, 0.1, (F, len(shape.log_length)))
+    steps = []
+    for more in (missed, 0.0):
+        graph, values = _graph(measurements, shape, more)
+        steps.append(graph.linearize(values).optimize())
+    envelope = measurements.envelope(conformal)
+    equations, _ = linearise(measurements, shape, lag(measurements, shape), envelope)
+    factorised = Factorised(equations, envelope, measurements.mesh.edges)
+    ours = moved(shape, envelope, *factorised.correction(missed, tolerance=1e-13))
+    for j in range(F):
+        for i in range(P):
+            depth = key(LOG_DEPTH, i, j)
+            expected = shape.log_depth[j, i] + (steps[0].at(depth) - steps[1].at(depth))[0]
+            assert ours.log_depth[j, i] == pytest.approx(expected, abs=1e-10)
+    for e in range(len(shape.log_length)):
+        length = key(LOG_LENGTH, e)
+        expected = shape.log_length[e] + (steps[0].at(length) - steps[1].at(length))[0]
+        assert ours.log_length[e] == pytest.approx(expected, abs=1e-10)
+
+
+@pytest.mark.parametrize("conformal", [False, True])
+def test_what_a_step_misses_is_of_second_order(conformal):
+    measurements, shape = _random_problem(conformal, bending=False)
+    envelope = measurements.envelope(conformal)
+    equations, _ = linearise(measurements, shape, lag(measurements, shape), envelope)
+    direction = np.random.default_rng(2).normal(0, 1e-3, equations.gradient.shape)
+    sizes = []
+    for part in (1.0, 0.5):
+        trial = moved(shape, envelope, part * direction, part)
+        sizes.append(np.abs(solve._missed(measurements, shape, trial, equations.border)))
+    assert sizes[0].max() > 1e-8
+    assert np.median(sizes[0] / sizes[1]) == pytest.approx(4.0, rel=0.05)
 
 
 def test_the_schur_complement_is_symmetric_and_positive_definite():

@@ -10,9 +10,10 @@ import pytest
 from connrsfm_graph.metrics import evaluate
 from connrsfm_graph.reconstruct import reconstruct
 from connrsfm_graph.refine import RefineConfig
+from connrsfm_graph.refine.measurements import Measurements, Shape
 from connrsfm_graph.refine.noise import Noise
 from connrsfm_graph.refine.reseat import reseated
-from connrsfm_graph.refine.solve import Measurements, Shape, minimise
+from connrsfm_graph.refine.solve import minimise
 from connrsfm_graph.refine.start import start_shape
 from connrsfm_graph.refine.task import Task
 from connrsfm_graph.refine.unseen import complete

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from connrsfm_graph.refine import RefineConfig
+from connrsfm_graph.refine.measurements import Shape
 from connrsfm_graph.refine.noise import Noise
 from connrsfm_graph.refine.restarts import restart
-from connrsfm_graph.refine.solve import Shape, fit_views, minimise
+from connrsfm_graph.refine.solve import fit_views, minimise
 from connrsfm_graph.refine.start import start_shape
 from connrsfm_graph.refine.task import Task
 from connrsfm_graph.refine.unseen import complete

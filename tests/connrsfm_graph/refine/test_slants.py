@@ -7,8 +7,8 @@ import pytest
 
 from connrsfm_graph.metrics import evaluate
 from connrsfm_graph.refine import RefineConfig, Refined, refine, slant
+from connrsfm_graph.refine.measurements import Measurements
 from connrsfm_graph.refine.noise import Noise
-from connrsfm_graph.refine.solve import Measurements
 from connrsfm_graph.refine.start import start_shape
 from connrsfm_graph.refine.task import Fit, Task
 from connrsfm_graph.refine.unseen import complete

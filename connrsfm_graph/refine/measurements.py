@@ -1,0 +1,207 @@
+"""What the refinement estimates, what that is compared with, its cost and its normal equations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from connrsfm_graph.refine.cost import Terms, Weights, cost_kernel, hinge_stencils, linearise_kernel
+from connrsfm_graph.refine.curvature import arc_offset_kernel
+from connrsfm_graph.refine.elimination import NormalEquations
+from connrsfm_graph.refine.envelope import Envelope, make_envelope
+from connrsfm_graph.refine.mesh import Mesh
+from connrsfm_graph.threads import over_views
+
+OF_VIEWS = ("log_depth", "correction", "log_factor")
+"""Parts of a shape that belong to single views."""
+
+
+@dataclass(frozen=True)
+class Shape:
+    """What is estimated."""
+
+    log_depth: np.ndarray
+    """(F, P)."""
+    correction: np.ndarray
+    """(F, P, 2) corrections of the sight rays, normalised coordinates."""
+    log_factor: np.ndarray
+    """(F, P) log conformal factors; (F, 0) in an isometric model."""
+    log_length: np.ndarray
+    """(E,) lengths shared by all views."""
+
+    def points(self, image: np.ndarray) -> np.ndarray:
+        """(F, P, 3) points in the camera frames, for tracked image points (F, P, 2)."""
+        depth = np.exp(self.log_depth)[..., None]
+        return np.concatenate([depth * (image + self.correction), depth], axis=-1)
+
+    def views(self, index: np.ndarray) -> Shape:
+        """The shape of some views."""
+        return Shape(self.log_depth[index], self.correction[index], self.log_factor[index], self.log_length)
+
+    def replaced(self, index: np.ndarray, other: Shape) -> Shape:
+        """The shape with some views taken from a shape of only these."""
+        parts = {name: getattr(self, name).copy() for name in OF_VIEWS}
+        for name, part in parts.items():
+            part[index] = getattr(other, name)
+        return replace(self, **parts)
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """What the shape is compared with."""
+
+    image: np.ndarray
+    """(F, P, 2) image points, normalised coordinates; finite everywhere, interpolated where not seen."""
+    image_weight: np.ndarray
+    """(F, P) inverse standard deviation of the image points."""
+    log_depth: np.ndarray
+    """(F, P) log depths of the start, about which those of the shape may drift."""
+    log_length: np.ndarray
+    """(E,) log lengths of the start, likewise; it keeps a part that hardly moves from coming off the surface."""
+    log_length_weight: np.ndarray
+    """(E,) their inverse standard deviation."""
+    length_weight: np.ndarray
+    """(F, E) inverse standard deviation of the log lengths."""
+    factor_weight: np.ndarray
+    """(F,) inverse standard deviation of the log conformal factors of a view; not used in an isometric model."""
+    mesh: Mesh
+    """Edges and hinges."""
+    weights: Weights
+    """Inverse standard deviations of the other terms."""
+
+    def envelope(self, conformal: bool) -> Envelope:
+        """Storage of the views' matrices."""
+        return make_envelope(self.mesh.order(), [self.mesh.edges, self.mesh.hinges], 4 if conformal else 3)
+
+    def views(self, index: np.ndarray) -> Measurements:
+        """The measurements of some views."""
+        return replace(
+            self,
+            image=self.image[index],
+            image_weight=self.image_weight[index],
+            log_depth=self.log_depth[index],
+            length_weight=self.length_weight[index],
+            factor_weight=self.factor_weight[index],
+        )
+
+    def replaced(self, index: np.ndarray, other: Measurements) -> Measurements:
+        """The measurements with some views taken from measurements of only these."""
+        names = ("image", "image_weight", "log_depth", "length_weight", "factor_weight")
+        parts = {name: getattr(self, name).copy() for name in names}
+        for name, part in parts.items():
+            part[index] = getattr(other, name)
+        return replace(self, **parts)
+
+
+@dataclass(frozen=True)
+class Lagged:
+    """Functions of the shape that are held fixed in its derivatives."""
+
+    offset: np.ndarray
+    """(F, E) log ratio of arc to chord."""
+    stencils: np.ndarray
+    """(H, 4) coefficients of the hinges."""
+
+
+def lag(measurements: Measurements, shape: Shape) -> Lagged:
+    """Hinge coefficients and arc offsets at a shape.
+
+    A conformal model compares chords: Moebius maps keep their ratios exactly, not those of arcs.
+    """
+    mesh, stencils = measurements.mesh, stencils_of(measurements, shape)
+    points = shape.points(measurements.image)
+    offset = np.zeros((len(points), len(mesh.edges)))
+    if shape.log_factor.size:
+        return Lagged(offset, stencils)
+    over_views(arc_offset_kernel, len(points), points, mesh.triangles, mesh.edges, offset)
+    return Lagged(offset, stencils)
+
+
+def stencils_of(measurements: Measurements, shape: Shape) -> np.ndarray:
+    """(H, 4) hinge coefficients at a shape; zero where bending is free."""
+    stencils = np.zeros((len(measurements.mesh.hinges), 4))
+    if measurements.weights.bending > 0.0:
+        hinge_stencils(np.exp(shape.log_length), measurements.mesh.hinge_edges, stencils)
+    return stencils
+
+
+def costs(measurements: Measurements, shape: Shape, lagged: Lagged) -> np.ndarray:
+    """(F,) cost of every view, see `view_cost`."""
+    cost = np.empty(len(shape.log_depth))
+    over_views(cost_kernel, len(cost), *kernel_arguments(measurements, shape, lagged), cost)
+    return cost
+
+
+def linearise(
+    measurements: Measurements,
+    shape: Shape,
+    lagged: Lagged,
+    envelope: Envelope,
+    storage: np.ndarray | None = None,
+) -> tuple[NormalEquations, np.ndarray]:
+    """Normal equations at a shape, and the length residuals (F, E); `storage` is that of a matrix no longer needed."""
+    F, _ = shape.log_depth.shape
+    n, E = len(envelope.first), len(measurements.mesh.edges)
+    matrix = np.empty((F, envelope.start[-1])) if storage is None else storage
+    gradient = np.empty((F, n))
+    border = np.empty((F, E, 8 if shape.log_factor.size else 6))
+    residual, weight = np.empty((F, E)), np.empty((F, E))
+    arguments = kernel_arguments(measurements, shape, lagged)
+    over_views(linearise_kernel, F, *arguments, envelope, matrix, gradient, border, residual, weight)
+    unit, frontal = measurements.weights.unit, measurements.weights.frontal
+    prior = measurements.log_length_weight**2
+    equations = NormalEquations(
+        matrix=matrix,
+        gradient=gradient,
+        border=border,
+        weight=weight,
+        unit=unit,
+        length_weight=prior,
+        length_gradient=unit**2 * shape.log_length.mean() / E
+        + F * frontal
+        + prior * (shape.log_length - measurements.log_length)
+        - (weight * residual).sum(axis=0),
+    )
+    return equations, residual
+
+
+def kernel_arguments(measurements: Measurements, shape: Shape, lagged: Lagged) -> tuple:
+    """What the kernels of the cost ask for."""
+    return (
+        shape.points(measurements.image),
+        shape.log_factor,
+        shape.log_depth - measurements.log_depth,
+        lagged.offset,
+        shape.correction,
+        measurements.image_weight,
+        measurements.length_weight,
+        measurements.factor_weight,
+        terms_of(measurements, shape, lagged.stencils),
+    )
+
+
+def terms_of(measurements: Measurements, shape: Shape, stencils: np.ndarray) -> Terms:
+    """What the kernels take as common to all views."""
+    mesh = measurements.mesh
+    return Terms(mesh.edges, mesh.n_near, mesh.hinges, stencils, shape.log_length, measurements.weights)
+
+
+def moved(shape: Shape, envelope: Envelope, views: np.ndarray, lengths: np.ndarray | float) -> Shape:
+    """The shape after a step: (F, n) of the views' unknowns and (E,) of the lengths."""
+    F, P = shape.log_depth.shape
+    step = views.reshape(F, P, -1)[:, envelope.unknown // (views.shape[1] // P)]
+    return Shape(
+        log_depth=shape.log_depth + step[..., 0],
+        correction=shape.correction + step[..., 1:3],
+        log_factor=shape.log_factor + step[..., 3] if shape.log_factor.size else shape.log_factor,
+        log_length=shape.log_length + lengths,
+    )
+
+
+def total_cost(measurements: Measurements, shape: Shape, lagged: Lagged) -> float:
+    """Cost of all views, and of the lengths' own priors."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        total = float(costs(measurements, shape, lagged).sum())
+    drift = measurements.log_length_weight * (shape.log_length - measurements.log_length)
+    return total + 0.5 * (measurements.weights.unit * float(shape.log_length.mean())) ** 2 + 0.5 * float(drift @ drift)
