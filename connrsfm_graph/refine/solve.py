@@ -97,10 +97,10 @@ def _missed(measurements: Measurements, shape: Shape, trial: Shape, border: np.n
     chords = []
     for each in (shape, trial):
         points = each.points(measurements.image)
-        chords.append(np.log(np.linalg.norm(points[:, i] - points[:, k], axis=-1)))
-    step = np.concatenate(
-        [(trial.log_depth - shape.log_depth)[..., None], trial.correction - shape.correction], axis=-1
-    )
+        square = ((points[:, i] - points[:, k]) ** 2).sum(axis=-1)
+        chords.append(0.5 * np.log(np.maximum(square, _COINCIDENT)))
+    depth = (trial.log_depth - shape.log_depth)[..., None]
+    step = np.concatenate([depth, trial.correction - shape.correction], axis=-1)
     m = border.shape[-1] // 2
     linear = (border[..., :3] * step[:, i]).sum(axis=-1) + (border[..., m : m + 3] * step[:, k]).sum(axis=-1)
     return np.asarray(chords[1] - chords[0] - linear)
