@@ -28,7 +28,7 @@ _AT_ONCE = 5
 """Samples that are solved together."""
 _TOLERANCE = 0.03
 """Relative accuracy of the linear solutions, well below that of a deviation from so few draws."""
-_SUREST = 0.0025
+_SUREST = 0.00125
 """Standard deviation of a log length, at least: a fit may hold them tighter, but chords of a mesh are not arcs, and
 such a fit is never quite at its minimum."""
 _SMOOTHINGS = 4
@@ -46,7 +46,7 @@ def log_depth_deviation(
     """(F, P) standard deviation of log depth, the scale common to all views left out.
 
     Args:
-        measurements: with the noise levels of the fit; lengths held tighter than to 0.0025 count as held to that.
+        measurements: with the noise levels of the fit; lengths held tighter than to 0.00125 count as held to that.
         shape: minimum of the cost.
         stretch: whether lengths vary alike for neighbours.
         jointly: whether the views were fitted together with the lengths. Else the lengths are taken as known, views do
