@@ -106,9 +106,4 @@ def _variety(options: Options) -> Iterable[Case]:
                 yield Case({"kind": kind, "method": name, "seed": seed}, partial(varied, kind, seed), method, config)
 
 
-VARIETY = Experiment(
-    "variety",
-    "Scenes of many kinds: 6 to 20 images, 40 to 250 points, 0.3 to 3 px noise, camera at rest or moving, up to 40 % "
-    "missing, all at random",
-    _variety,
-)
+VARIETY = Experiment("variety", "Scenes of many kinds, all else at random", _variety)
