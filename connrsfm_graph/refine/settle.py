@@ -19,7 +19,7 @@ _IN_VAIN = 2
 """So often the assumed length noise is halved without points left out being predicted better: what one halving does not
 show the next may."""
 _LEAST = 0.005
-"""It is never taken for less than this part of what it was assumed to be at first."""
+"""Below this part of what it was assumed to be at first it is not halved again."""
 
 
 def settled(task: Task, found: Fit) -> Fit:
