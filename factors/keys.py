@@ -12,6 +12,7 @@ A key packs a letter (8 bits), a first index (32 bits) and a second index (24 bi
 | `q` | correction of the sight ray | point, view | 2 |
 | `f` | log conformal factor of a view | point, view | 1 |
 | `e` | latent log edge length | mesh edge, 0 | 1 |
+| `h` | homogeneous strain of a view | 0, view | 2 |
 | `t` | camera pose | 0, view | 6 |
 | `g` | log scale of a view | 0, view | 1 |
 | `m` | map point | point, view | 3 |
@@ -29,6 +30,7 @@ LOG_SCALE = "s"
 RAY_CORRECTION = "q"
 LOG_FACTOR = "f"
 LOG_LENGTH = "e"
+STRAIN = "h"
 CAMERA_POSE = "t"
 VIEW_SCALE = "g"
 MAP_POINT = "m"
@@ -42,6 +44,7 @@ _NAMES = {
     RAY_CORRECTION: ("ray correction", "point", "view"),
     LOG_FACTOR: ("log conformal factor", "point", "view"),
     LOG_LENGTH: ("log edge length", "mesh edge", None),
+    STRAIN: ("homogeneous strain", None, "view"),
     CAMERA_POSE: ("camera pose", None, "view"),
     VIEW_SCALE: ("log view scale", None, "view"),
     MAP_POINT: ("map point", "point", "view"),

@@ -9,6 +9,7 @@ from typing import Literal, get_args
 from connrsfm_graph.errors import InputError
 
 Model = Literal["auto", "isometric", "conformal"]
+Stretched = Literal["auto", "yes", "no"]
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,11 @@ class RefineConfig:
     Where the tracks are noisy it is where a smaller one is looked for, as far as that predicts points left out."""
     factor_sigma: float = 0.2
     """Standard deviation of the difference of log conformal factor between neighbours, for the conformal model."""
+    stretched: Stretched = "auto"
+    """Whether, in the isometric model, each view may also be pulled as a whole along one direction: `yes`, `no`, or
+    `auto`, where isometry misses the data and that explains by far the most of it."""
+    strain_sigma: float = 0.2
+    """Standard deviation of the two numbers of such a pull, a homogeneous strain."""
     rings: int = 2
     """Edges join points up to this distance in the triangulation, 1 or 2."""
     outliers: bool = True
@@ -47,7 +53,11 @@ class RefineConfig:
     def __post_init__(self) -> None:
         if self.model not in get_args(Model):
             raise InputError(f"refine.model is '{self.model}', expected one of {', '.join(get_args(Model))}")
-        for name in ("length_sigma", "factor_sigma", "bending_sigma"):
+        if self.stretched not in get_args(Stretched):
+            raise InputError(
+                f"refine.stretched is '{self.stretched}', expected one of {', '.join(get_args(Stretched))}"
+            )
+        for name in ("length_sigma", "factor_sigma", "strain_sigma", "bending_sigma"):
             if not 0.0 < getattr(self, name) < math.inf:
                 raise InputError(f"refine.{name} is {getattr(self, name)}, expected a positive number")
         if self.rings not in (1, 2):

@@ -1,14 +1,17 @@
-"""Block elimination of the refinement's normal equations: views first, shared lengths last.
+"""Block elimination of the refinement's normal equations: views first, what borders them last.
 
     [ H_1            W_1 ] [x_1]     [g_1]
     [      ...       ... ] [...] = - [...]         H_f sparse, W_f two points per column
     [           H_F  W_F ] [x_F]     [g_F]
-    [ W_1' ...  W_F'  D  ] [ l ]     [ h ]          D diagonal, plus the mean length's prior of rank one
+    [ W_1' ...  W_F'  D  ] [ l ]     [ h ]          l shared lengths and, of stretched views, their strains
 
 Each view's H_f is factored by Cholesky inside its envelope: row r is stored from its first non-zero column on, and
 points are ordered by a sweep across the surface, so rows are short. The cost is linear in views. The Schur complement
-S = D - sum_f W_f' H_f^-1 W_f on the lengths is dense, so it is never formed: conjugate gradients apply it by one
+S = D - sum_f W_f' H_f^-1 W_f on the border is dense, so it is never formed: conjugate gradients apply it by one
 forward and backward substitution per view. Several right-hand sides at once read each view's factor once for all.
+
+A length residual falls by the sum of its shared length and its view's strain times a derivative; all of S acts through
+these sums, one for every residual.
 """
 
 from __future__ import annotations
@@ -33,14 +36,25 @@ class NormalEquations:
     """(F, n) gradients g_f."""
     border: np.ndarray
     """(F, E, 2 m) derivative of each length residual by the m unknowns of its two points."""
+    by_strain: np.ndarray
+    """(F, E, K) derivative of what each length residual falls by, by the K numbers of its view's strain; K may be 0."""
     weight: np.ndarray
-    """(F, E) weight of each length residual; W_f = -(weight border)'."""
+    """(F, E) weight of each length residual; W_f = -(weight border)' on the sums of lengths and strains."""
     length_gradient: np.ndarray
     """(E,) h."""
     unit: float
     """Inverse standard deviation of the mean log length."""
     length_weight: np.ndarray
     """(E,) weight of every log length's own prior."""
+    strain_gradient: np.ndarray
+    """(F, K)."""
+    strain_weight: float
+    """Weight of the strains' own prior."""
+
+    @property
+    def border_gradient(self) -> np.ndarray:
+        """(E + F K,) h."""
+        return np.concatenate([self.length_gradient, self.strain_gradient.ravel()])
 
 
 @njit(cache=True, inline="always")
@@ -75,21 +89,23 @@ def _spread_all(begin, end, border, weight, ends, v, x):
 
 @njit(cache=True, nogil=True)
 def _gather_all(begin, end, border, weight, ends, x, out):
-    """out_fs = W_f' x_sf for views begin to end - 1."""
+    """out_sf = W_f' x_sf for views begin to end - 1."""
     for f in range(begin, end):
         for s in range(len(x)):
-            _gather(border[f], weight[f], ends, x[s, f], out[f, s])
+            _gather(border[f], weight[f], ends, x[s, f], out[s, f])
 
 
 @njit(cache=True, nogil=True)
 def _schur_terms(begin, end, factor, first, start, border, weight, ends, v, out):
-    """out_fs = W_f' H_f^-1 W_f v_s for views begin to end - 1."""
+    """out_sf = (D_f - W_f' H_f^-1 W_f) v_sf for views begin to end - 1, but for the priors."""
     for f in range(begin, end):
         for s in range(len(v)):
             x = np.zeros(len(first))
-            spread_view(border[f], weight[f], ends, v[s], x)
+            spread_view(border[f], weight[f], ends, v[s, f], x)
             substitute(factor[f], first, start, x)
-            _gather(border[f], weight[f], ends, x, out[f, s])
+            _gather(border[f], weight[f], ends, x, out[s, f])
+            for e in range(len(ends)):
+                out[s, f, e] = weight[f, e] * v[s, f, e] - out[s, f, e]
 
 
 class Factorised:
@@ -110,7 +126,11 @@ class Factorised:
         self.equations = equations
         self.envelope = envelope
         self.ends = envelope.unknown[edges]
-        self.diagonal = (equations.weight.sum(axis=0) + equations.length_weight) * (1.0 + damping)
+        of_strains = np.einsum("fe,fek->fk", equations.weight, equations.by_strain**2) + equations.strain_weight
+        of_lengths = equations.weight.sum(axis=0) + equations.length_weight
+        self.diagonal = np.concatenate([of_lengths, of_strains.ravel()]) * (1.0 + damping)
+        priors = equations.length_weight, np.full(of_strains.size, equations.strain_weight)
+        self.prior = np.concatenate(priors) + self.diagonal * (damping / (1.0 + damping))
         self.factor = equations.matrix
         fine = np.empty(len(self.factor), dtype=bool)
         over_views(factor_kernel, len(fine), self.factor, damping, envelope.first, envelope.start, fine)
@@ -131,21 +151,38 @@ class Factorised:
         return x
 
     def gather(self, x: np.ndarray) -> np.ndarray:
-        """sum_f W_f' x_f, shape (S, E), from (S, F, n)."""
+        """sum_f W_f' x_f, shape (S, E + F K), from (S, F, n)."""
         F, E = self.equations.weight.shape
-        out = np.empty((F, len(x), E))
+        out = np.empty((len(x), F, E))
         over_views(_gather_all, F, self.equations.border, self.equations.weight, self.ends, x, out)
-        return out.sum(axis=0)
+        return self.border_part(out)
+
+    def of_residuals(self, v: np.ndarray) -> np.ndarray:
+        """What every length residual falls by, (S, F, E) or (S, 1, E), for lengths and strains (S, E + F K)."""
+        F, E, K = self.equations.by_strain.shape
+        if not K:
+            return v[:, None]
+        strain = v[:, E:].reshape(-1, F, K)
+        return v[:, None, :E] + np.einsum("fek,sfk->sfe", self.equations.by_strain, strain)
+
+    def border_part(self, values: np.ndarray) -> np.ndarray:
+        """The transpose: (S, E + F K) from values at length residuals (S, F, E)."""
+        by_strain = np.einsum("fek,sfe->sfk", self.equations.by_strain, values)
+        return np.concatenate([values.sum(axis=1), by_strain.reshape(len(values), -1)], axis=1)
 
     def schur_product(self, v: np.ndarray) -> np.ndarray:
-        """S v, shape (S, E)."""
+        """S v, shape (S, E + F K)."""
         e = self.equations
-        out = np.empty((len(e.weight), *v.shape))
-        over_views(_schur_terms, len(out), self.factor, *self.envelope[:2], e.border, e.weight, self.ends, v, out)
-        return self.diagonal * v + e.unit**2 * v.mean(axis=1, keepdims=True) / v.shape[1] - out.sum(axis=0)
+        F, E = e.weight.shape
+        out = np.empty((len(v), F, E))
+        sums = np.ascontiguousarray(np.broadcast_to(self.of_residuals(v), out.shape))
+        over_views(_schur_terms, F, self.factor, *self.envelope[:2], e.border, e.weight, self.ends, sums, out)
+        product = self.border_part(out) + self.prior * v
+        product[:, :E] += e.unit**2 * v[:, :E].mean(axis=1, keepdims=True) / E
+        return product
 
-    def solve_lengths(self, rhs: np.ndarray, tolerance: float, limit: int = 500) -> np.ndarray:
-        """S^-1 rhs, shape (S, E), by conjugate gradients preconditioned with D.
+    def solve_border(self, rhs: np.ndarray, tolerance: float, limit: int = 500) -> np.ndarray:
+        """S^-1 rhs, shape (S, E + F K), by conjugate gradients preconditioned with the diagonal of D.
 
         Each right-hand side on its own, to a relative `tolerance` or `limit` products.
         """
@@ -169,20 +206,20 @@ class Factorised:
         return v
 
     def step(self, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
-        """Gauss-Newton step: (F, n) of the views' unknowns and (E,) of the lengths."""
-        views, lengths = self.solve(self.equations.gradient[None], self.equations.length_gradient[None], tolerance)
-        return views[0], lengths[0]
+        """Gauss-Newton step: (F, n) of the views' unknowns and (E + F K,) of the lengths and strains."""
+        views, border = self.solve(self.equations.gradient[None], self.equations.border_gradient[None], tolerance)
+        return views[0], border[0]
 
     def correction(self, residual: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
         """Step against length residuals (F, E) that a step has left beyond what its linearisation says."""
-        lengths = -(self.equations.weight * residual).sum(axis=0)
-        views, lengths = self.solve(-self.spread(residual[None]), lengths[None], tolerance)
-        return views[0], lengths[0]
+        gradient = self.border_part(-(self.equations.weight * residual)[None])
+        views, border = self.solve(-self.spread(residual[None]), gradient, tolerance)
+        return views[0], border[0]
 
     def solve(
-        self, gradient: np.ndarray, length_gradient: np.ndarray, tolerance: float
+        self, gradient: np.ndarray, border_gradient: np.ndarray, tolerance: float
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Minus the inverse of the whole matrix times (S, F, n) and (S, E)."""
+        """Minus the inverse of the whole matrix times (S, F, n) and (S, E + F K)."""
         inner = self.solve_views(gradient)
-        lengths = self.solve_lengths(self.gather(inner) - length_gradient, tolerance)
-        return -inner - self.solve_views(self.spread(lengths[:, None])), lengths
+        border = self.solve_border(self.gather(inner) - border_gradient, tolerance)
+        return -inner - self.solve_views(self.spread(self.of_residuals(border))), border

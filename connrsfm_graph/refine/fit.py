@@ -7,19 +7,18 @@ from dataclasses import replace
 import numpy as np
 
 from connrsfm_graph.refine.ambiguity import resolve
-from connrsfm_graph.refine.measurements import Measurements, Shape, costs, lag
+from connrsfm_graph.refine.caught import reseated_where_dear, restarted_where_dear
+from connrsfm_graph.refine.measurements import Measurements, Shape
 from connrsfm_graph.refine.noise import Noise
-from connrsfm_graph.refine.reseat import reseat
 from connrsfm_graph.refine.restarts import inverted, restart
 from connrsfm_graph.refine.settle import BEYOND_DOUBT, noise_evidence, settled, trusting_lengths
 from connrsfm_graph.refine.slant import seen_frontally
 from connrsfm_graph.refine.start import start_shape
+from connrsfm_graph.refine.strain import stretched
 from connrsfm_graph.refine.task import Fit, Task, minimised
 
 _RESTARTS = 4
 """Rounds of restarts, at most."""
-_SUSPECT = (1.5, 0.02)
-"""So may one of an isometric fit that costs so many times the lower quartile of the views, and so much per edge."""
 _PROMISING = 2.0
 """Views of a second fit are restarted where it costs at most this many times the first."""
 _MISFIT = 1.0
@@ -41,17 +40,17 @@ def fit(task: Task, sigma_image: float) -> Fit:
     wanted = task.config.model
     if wanted == "conformal":
         return fit_conformal(task, noise)
-    isometric = fit_isometric(task, noise)
+    own, isometric = stretched(task, fit_isometric(task, noise), noise)
     misfit = isometric.misfit()
     isometric.evidence["isometric misfit"] = misfit
     if wanted == "isometric" or misfit <= _MISFIT:
-        return _finished(task, isometric)
+        return _finished(own, isometric)
     conformal = fit_conformal(task, noise)
     ratio = isometric.first_cost / max(conformal.first_cost, 1e-300)
     for found in (isometric, conformal):
         found.evidence["isometric misfit"] = misfit
         found.evidence["isometric over conformal cost"] = ratio
-    return conformal if ratio > _RATIO else _finished(task, isometric)
+    return conformal if ratio > _RATIO else _finished(own, isometric)
 
 
 def fit_isometric(task: Task, noise: Noise) -> Fit:
@@ -64,14 +63,14 @@ def fit_isometric(task: Task, noise: Noise) -> Fit:
     misfit = found.misfit()
     if misfit > _MISFIT or (misfit > BEYOND_DOUBT and not found.looks_like_noise(task)):
         # The surface may stretch, or the start may be to blame for all views alike; flat ones are neutral.
-        flat = replace(task, completed=replace(task.completed, log_depth=np.zeros_like(task.completed.log_depth)))
+        flat = task.flat()
         again = _from_start(flat, noise, _PROMISING * found.first_cost)
         if again.first_cost < found.first_cost:
             task, found = flat, again
     if found.misfit() > _MISFIT:
-        found = _restarted_where_dear(task, found, lend=True)
-    found = settled(task, _reseated(task, found))
-    return replace(_restarted_where_dear(task, found), first_cost=found.first_cost)
+        found = restarted_where_dear(task, found, lend=True)
+    found = settled(task, reseated_where_dear(task, found))
+    return replace(restarted_where_dear(task, found), first_cost=found.first_cost)
 
 
 def _finished(task: Task, isometric: Fit) -> Fit:
@@ -86,47 +85,7 @@ def _from_start(task: Task, noise: Noise, worth: float = np.inf) -> Fit:
     measurements = task.measurements(noise, conformal=False)
     shape, history = minimised(task, measurements, start_shape(task.completed, task.mesh))
     found = Fit(measurements, shape, noise, history, history[-1])
-    return _restarted_where_dear(task, found) if history[-1] < worth else found
-
-
-def _restarted_where_dear(task: Task, found: Fit, lend: bool = False) -> Fit:
-    """The fit with views that cost more than others restarted until none gains; `lend` says whether also from the
-    surfaces of those others."""
-    measurements = found.measurements
-    for _ in range(_RESTARTS):
-        suspect = _suspect(measurements, found.shape)
-        if len(suspect) == 0:
-            break
-        others = np.delete(found.shape.points(measurements.image), suspect, axis=0) if lend else None
-        better, renewed = restart(measurements.views(suspect), found.shape.views(suspect), others)
-        if not renewed.any():
-            break
-        shape, more = minimised(task, measurements, found.shape.replaced(suspect, better))
-        found = replace(found, shape=shape, history=found.history + more, first_cost=more[-1])
-    return found
-
-
-def _suspect(measurements: Measurements, shape: Shape) -> np.ndarray:
-    """Numbers of the views that cost more than others."""
-    factor, per_edge = _SUSPECT
-    cost = costs(measurements, shape, lag(measurements, shape))
-    return np.flatnonzero(cost > max(factor * np.quantile(cost, 0.25), per_edge * len(measurements.mesh.edges)))
-
-
-def _reseated(task: Task, found: Fit) -> Fit:
-    """The fit with single points elsewhere in views that still cost more than others, as long as that pays."""
-    for _ in range(_RESTARTS):
-        suspect = _suspect(found.measurements, found.shape)
-        if len(suspect) == 0:
-            break
-        better, renewed = reseat(found.measurements.views(suspect), found.shape.views(suspect))
-        if not renewed.any():
-            break
-        shape, more = minimised(task, found.measurements, found.shape.replaced(suspect, better))
-        if not more[-1] < found.first_cost:
-            break
-        found = replace(found, shape=shape, history=found.history + more, first_cost=more[-1])
-    return found
+    return restarted_where_dear(task, found) if history[-1] < worth else found
 
 
 def fit_conformal(task: Task, noise: Noise) -> Fit:
@@ -138,7 +97,7 @@ def fit_conformal(task: Task, noise: Noise) -> Fit:
     shape, history = _restarted(task, measurements, start_shape(task.completed, task.mesh, conformal=True))
     (F, P), E = shape.log_depth.shape, len(shape.log_length)
     if 2.0 * history[-1] > _DOUBT * max(F * E - 2 * F * P - E, 1):
-        flat = replace(task.completed, log_depth=np.zeros((F, P)))
+        flat = task.flat().completed
         second, more = _restarted(task, measurements, start_shape(flat, task.mesh, conformal=True))
         if more[-1] < history[-1]:
             shape, history = second, history + more

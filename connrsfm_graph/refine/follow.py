@@ -7,7 +7,7 @@ cost. This is what makes the work linear in the views, in any order and in paral
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from connrsfm_graph.refine.measurements import Measurements, Shape, costs, lag
 from connrsfm_graph.refine.reseat import reseat
 from connrsfm_graph.refine.resection import moved_rigidly
 from connrsfm_graph.refine.restarts import inverted, restart
-from connrsfm_graph.refine.solve import fit_views
+from connrsfm_graph.refine.solve import fit_views, minimise
 from connrsfm_graph.refine.task import Fit
 from connrsfm_graph.refine.uncertainty import log_depth_deviation
 from connrsfm_graph.refine.unseen import Template, complete_images
@@ -28,6 +28,8 @@ _CAUGHT = (3.0, 0.02)
 """A view that costs so many times the median fitted view, and so much per edge, may be caught in a wrong shape."""
 _TOLERANCE = 0.01
 """A view's fit ends where an iteration gains less than this part."""
+_HELD = 1e6
+"""Inverse standard deviation of log lengths that are known, while strains are found."""
 
 
 @dataclass(frozen=True)
@@ -139,7 +141,7 @@ def _fitted(
     image, deviation = complete_images(image, seen, reference.template)
     held = fit.shape.views(nearest)
     surface = moved_rigidly(fit.shape.points(fit.measurements.image)[nearest], image, seen)
-    start = Shape(np.log(surface[..., 2]), np.zeros_like(image), held.log_factor, held.log_length)
+    start = replace(held, log_depth=np.log(surface[..., 2]), correction=np.zeros_like(image))
     B, E = len(seen), len(fit.measurements.mesh.edges)
     measurements = Measurements(
         image=image,
@@ -149,6 +151,7 @@ def _fitted(
         log_length_weight=fit.measurements.log_length_weight,
         length_weight=np.full((B, E), 1.0 / fit.noise.length),
         factor_weight=fit.measurements.factor_weight[nearest],
+        strain_weight=fit.measurements.strain_weight,
         mesh=fit.measurements.mesh,
         weights=fit.measurements.weights,
     )
@@ -160,4 +163,7 @@ def _fitted(
         if not better.log_factor.size:
             better, _ = reseat(measurements.views(caught), better)
         shape = shape.replaced(caught, better)
+    if shape.strain.size:
+        held_lengths = replace(measurements, log_length_weight=np.full(E, _HELD))
+        shape, _ = minimise(held_lengths, shape, config.iterations, _TOLERANCE)
     return measurements, shape

@@ -11,9 +11,10 @@ from connrsfm_graph.refine.curvature import arc_offset_kernel
 from connrsfm_graph.refine.elimination import NormalEquations
 from connrsfm_graph.refine.envelope import Envelope, make_envelope
 from connrsfm_graph.refine.mesh import Mesh
+from connrsfm_graph.refine.stretch import stretches
 from connrsfm_graph.threads import over_views
 
-OF_VIEWS = ("log_depth", "correction", "log_factor")
+OF_VIEWS = ("log_depth", "correction", "log_factor", "strain")
 """Parts of a shape that belong to single views."""
 
 
@@ -29,6 +30,8 @@ class Shape:
     """(F, P) log conformal factors; (F, 0) in an isometric model."""
     log_length: np.ndarray
     """(E,) lengths shared by all views."""
+    strain: np.ndarray
+    """(F, 2) homogeneous strains of the views; (F, 0) where they are not stretched, as in every conformal model."""
 
     def points(self, image: np.ndarray) -> np.ndarray:
         """(F, P, 3) points in the camera frames, for tracked image points (F, P, 2)."""
@@ -37,7 +40,7 @@ class Shape:
 
     def views(self, index: np.ndarray) -> Shape:
         """The shape of some views."""
-        return Shape(self.log_depth[index], self.correction[index], self.log_factor[index], self.log_length)
+        return replace(self, **{name: getattr(self, name)[index] for name in OF_VIEWS})
 
     def replaced(self, index: np.ndarray, other: Shape) -> Shape:
         """The shape with some views taken from a shape of only these."""
@@ -65,6 +68,8 @@ class Measurements:
     """(F, E) inverse standard deviation of the log lengths."""
     factor_weight: np.ndarray
     """(F,) inverse standard deviation of the log conformal factors of a view; not used in an isometric model."""
+    strain_weight: float
+    """Inverse standard deviation of the two numbers of a view's strain; not used where views are not stretched."""
     mesh: Mesh
     """Edges and hinges."""
     weights: Weights
@@ -151,10 +156,13 @@ def linearise(
     over_views(linearise_kernel, F, *arguments, envelope, matrix, gradient, border, residual, weight)
     unit, frontal = measurements.weights.unit, measurements.weights.frontal
     prior = measurements.log_length_weight**2
+    _, by_strain = stretches(shape.strain, measurements.mesh.direction)
+    held = measurements.strain_weight**2
     equations = NormalEquations(
         matrix=matrix,
         gradient=gradient,
         border=border,
+        by_strain=by_strain,
         weight=weight,
         unit=unit,
         length_weight=prior,
@@ -162,17 +170,20 @@ def linearise(
         + F * frontal
         + prior * (shape.log_length - measurements.log_length)
         - (weight * residual).sum(axis=0),
+        strain_weight=held,
+        strain_gradient=held * shape.strain - np.einsum("fe,fek->fk", weight * residual, by_strain),
     )
     return equations, residual
 
 
 def kernel_arguments(measurements: Measurements, shape: Shape, lagged: Lagged) -> tuple:
     """What the kernels of the cost ask for."""
+    change, _ = stretches(shape.strain, measurements.mesh.direction)
     return (
         shape.points(measurements.image),
         shape.log_factor,
         shape.log_depth - measurements.log_depth,
-        lagged.offset,
+        lagged.offset - change,
         shape.correction,
         measurements.image_weight,
         measurements.length_weight,
@@ -187,21 +198,24 @@ def terms_of(measurements: Measurements, shape: Shape, stencils: np.ndarray) -> 
     return Terms(mesh.edges, mesh.n_near, mesh.hinges, stencils, shape.log_length, measurements.weights)
 
 
-def moved(shape: Shape, envelope: Envelope, views: np.ndarray, lengths: np.ndarray | float) -> Shape:
-    """The shape after a step: (F, n) of the views' unknowns and (E,) of the lengths."""
-    F, P = shape.log_depth.shape
+def moved(shape: Shape, envelope: Envelope, views: np.ndarray, border: np.ndarray | float) -> Shape:
+    """The shape after a step: (F, n) of the views' unknowns and (E + F K,) of the lengths and the strains."""
+    (F, P), E = shape.log_depth.shape, len(shape.log_length)
+    lengths, strain = np.split(np.broadcast_to(border, E + shape.strain.size), [E])
     step = views.reshape(F, P, -1)[:, envelope.unknown // (views.shape[1] // P)]
     return Shape(
         log_depth=shape.log_depth + step[..., 0],
         correction=shape.correction + step[..., 1:3],
         log_factor=shape.log_factor + step[..., 3] if shape.log_factor.size else shape.log_factor,
         log_length=shape.log_length + lengths,
+        strain=shape.strain + strain.reshape(shape.strain.shape),
     )
 
 
 def total_cost(measurements: Measurements, shape: Shape, lagged: Lagged) -> float:
-    """Cost of all views, and of the lengths' own priors."""
+    """Cost of all views, and of the lengths' and the strains' own priors."""
     with np.errstate(over="ignore", invalid="ignore"):
         total = float(costs(measurements, shape, lagged).sum())
     drift = measurements.log_length_weight * (shape.log_length - measurements.log_length)
-    return total + 0.5 * (measurements.weights.unit * float(shape.log_length.mean())) ** 2 + 0.5 * float(drift @ drift)
+    total += 0.5 * (measurements.weights.unit * float(shape.log_length.mean())) ** 2 + 0.5 * float(drift @ drift)
+    return total + 0.5 * float(((measurements.strain_weight * shape.strain) ** 2).sum())

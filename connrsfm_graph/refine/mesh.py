@@ -35,6 +35,13 @@ class Mesh:
     """(H, 5) int, the edges 01, 02, 12, 03, 13 of each hinge."""
 
     @property
+    def direction(self) -> np.ndarray:
+        """(E, 2) cosine and sine of twice every edge's angle in the plane."""
+        x, y = (self.position[self.edges[:, 1]] - self.position[self.edges[:, 0]]).T
+        square = np.maximum(x * x + y * y, np.finfo(float).tiny)
+        return np.stack([(x * x - y * y) / square, 2.0 * x * y / square], axis=1)
+
+    @property
     def n_points(self) -> int:
         return len(self.position)
 

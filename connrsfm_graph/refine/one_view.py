@@ -23,10 +23,20 @@ def _place(image, log_depth, correction, X):
         X[i, 2] = depth
 
 
+@njit(cache=True, inline="always")
+def _offset(X, edges, triangles, conformal, stretch, offset):
+    """What is added to the log chords of one view, into `offset` (E,)."""
+    if conformal:
+        offset[:] = 0.0
+    else:
+        arc_offsets(X, edges, triangles, offset)
+    offset -= stretch
+
+
 @njit(cache=True, nogil=True)
 def fit_views_kernel(
-    first, last, image, image_weight, anchor, length_weight, factor_weight, triangles, terms, envelope, iterations,
-    tolerance, exact, damping_range, log_depth, correction, log_factor, cost,
+    first, last, image, image_weight, anchor, length_weight, factor_weight, triangles, stretch, terms, envelope,
+    iterations, tolerance, exact, damping_range, log_depth, correction, log_factor, cost,
 ):  # fmt: skip
     """Fit views first to last - 1.
 
@@ -34,6 +44,7 @@ def fit_views_kernel(
         image, image_weight, length_weight, factor_weight: as in `measurements.Measurements`.
         anchor: (F, P) log depths about which those of the shape may drift.
         triangles: (T, 3) of the mesh.
+        stretch: (F, E) changes of log lengths in the views.
         terms: what all views share.
         envelope: storage of a view's matrix.
         iterations: at most so many.
@@ -55,8 +66,7 @@ def fit_views_kernel(
         damping = damping_range[0]
         for _ in range(iterations):
             _place(image[v], b, q, X)
-            if not conformal:
-                arc_offsets(X, terms.edges, triangles, offset)
+            _offset(X, terms.edges, triangles, conformal, stretch[v], offset)
             before = view_cost(X, f, b - anchor[v], offset, q, *of_view)
             linearise_view(X, f, b - anchor[v], offset, q, *of_view, envelope, matrix, step, border, residual, weight)
             after = np.inf
@@ -79,6 +89,5 @@ def fit_views_kernel(
             if before - after <= tolerance * before or after <= exact:
                 break
         _place(image[v], b, q, X)
-        if not conformal:
-            arc_offsets(X, terms.edges, triangles, offset)
+        _offset(X, terms.edges, triangles, conformal, stretch[v], offset)
         cost[v] = view_cost(X, f, b - anchor[v], offset, q, *of_view)

@@ -13,6 +13,7 @@ from scipy import sparse
 
 from connrsfm_graph.refine.measurements import Measurements, Shape, costs, lag
 from connrsfm_graph.refine.solve import fit_views
+from connrsfm_graph.refine.stretch import stretches
 
 _STEPS = np.linspace(-0.3, 0.3, 61)
 """Changes of log depth that are tried."""
@@ -41,7 +42,8 @@ def reseated(measurements: Measurements, shape: Shape) -> Shape:
     """
     edges = measurements.mesh.edges
     point, other = np.concatenate([edges, edges[:, ::-1]]).T  # every edge from either end
-    wanted = np.tile(shape.log_length - lag(measurements, shape).offset, 2)
+    stretch, _ = stretches(shape.strain, measurements.mesh.direction)
+    wanted = np.tile(shape.log_length + stretch - lag(measurements, shape).offset, 2)
     weight = np.tile(measurements.length_weight, 2)
     X = shape.points(measurements.image)
     of_point = sparse.csr_array((np.ones(len(point)), (np.arange(len(point)), point)), (len(point), X.shape[1]))

@@ -21,6 +21,7 @@ from connrsfm_graph.refine.measurements import Measurements, Shape, costs, lag
 from connrsfm_graph.refine.resection import moved_rigidly
 from connrsfm_graph.refine.solve import fit_views
 from connrsfm_graph.refine.start import log_chords
+from connrsfm_graph.refine.stretch import stretches
 
 _ITERATIONS = 25
 _TOLERANCE = 0.02
@@ -56,11 +57,10 @@ def inverted(shape: Shape, image: np.ndarray, views: np.ndarray) -> Shape:
     squared = 2.0 * np.log(np.linalg.norm(shape.points(image), axis=-1))
     shift = squared.mean(axis=1, keepdims=True)
     flip = views[:, None]
-    return Shape(
+    return replace(
+        shape,
         log_depth=np.where(flip, shape.log_depth - squared + shift, shape.log_depth),
-        correction=shape.correction,
         log_factor=np.where(flip, shape.log_factor - squared + shift, shape.log_factor),
-        log_length=shape.log_length,
     )
 
 
@@ -108,7 +108,7 @@ def _starts(measurements: Measurements, shape: Shape) -> Iterator[Shape]:
     mean = shape.log_depth.mean(axis=1, keepdims=True)
     relief = shape.log_depth - plane
     for log_depth in (plane, plane - relief, 2.0 * mean - plane + relief, 2.0 * mean - shape.log_depth):
-        yield Shape(log_depth, shape.correction, shape.log_factor, shape.log_length)
+        yield replace(shape, log_depth=log_depth)
     if shape.log_factor.size:
         yield inverted(shape, measurements.image, np.ones(F, dtype=bool))
     else:
@@ -116,7 +116,7 @@ def _starts(measurements: Measurements, shape: Shape) -> Iterator[Shape]:
     flat = np.zeros_like(shape.log_factor)
     for angle in np.arange(_TILTS) * (2.0 * np.pi / _TILTS):
         tilt = _STEEP * (centred @ np.array([np.cos(angle), np.sin(angle)])) / spread
-        yield Shape(mean + tilt, shape.correction, flat, shape.log_length)
+        yield replace(shape, log_depth=mean + tilt, log_factor=flat)
 
 
 def _lent(measurements: Measurements, shape: Shape, others: np.ndarray) -> Iterator[Shape]:
@@ -148,14 +148,15 @@ def _folded(shape: Shape, ray: np.ndarray) -> Iterator[Shape]:
             reflected = 2.0 * (depth + slope * (along - middle)) - shape.log_depth
             for beyond in (offset > 0.0, offset < 0.0):
                 log_depth = np.where(beyond, reflected, shape.log_depth)
-                yield Shape(log_depth, shape.correction, shape.log_factor, shape.log_length)
+                yield replace(shape, log_depth=log_depth)
 
 
 def _scaled(measurements: Measurements, shape: Shape) -> Shape:
     """Every view scaled so that the median of its length residuals is zero."""
     edges = measurements.mesh.edges
-    residual = log_chords(shape.points(measurements.image), edges) - shape.log_length
+    length = shape.log_length + stretches(shape.strain, measurements.mesh.direction)[0]
+    residual = log_chords(shape.points(measurements.image), edges) - length
     if shape.log_factor.size:
         residual -= 0.5 * (shape.log_factor[:, edges[:, 0]] + shape.log_factor[:, edges[:, 1]])
     shift = np.median(residual, axis=1, keepdims=True)
-    return Shape(shape.log_depth - shift, shape.correction, shape.log_factor, shape.log_length)
+    return replace(shape, log_depth=shape.log_depth - shift)

@@ -49,9 +49,10 @@ def trusting_lengths(task: Task, found: Fit) -> Fit:
     """A settled fit with half the length noise, again and again while points left out are predicted better.
 
     That tells what keeps its lengths, as paper does, from what stretches a little. Only noise of the image points asks
-    for it, and slants are settled before: while lengths are held tightly they hardly move.
+    for it, and slants are settled before: while lengths are held tightly they hardly move. What is pulled as a whole is
+    never pulled quite evenly; tighter lengths would predict what is near, and tilt the rest.
     """
-    if not found.noisy or found.misfit() < BEYOND_DOUBT:
+    if not found.noisy or found.misfit() < BEYOND_DOUBT or found.shape.strain.size:
         return found
     errors = prediction_errors(found.measurements, found.shape, task.seen)
     trial, in_vain = found, 0

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from connrsfm_graph.errors import ComputationError
-from connrsfm_graph.refine.elimination import Factorised
+from connrsfm_graph.refine.elimination import Factorised, NormalEquations
 from connrsfm_graph.refine.measurements import (
     OF_VIEWS,
     Measurements,
@@ -20,6 +20,7 @@ from connrsfm_graph.refine.measurements import (
     total_cost,
 )
 from connrsfm_graph.refine.one_view import fit_views_kernel
+from connrsfm_graph.refine.stretch import stretches
 from connrsfm_graph.threads import over_views
 
 _DAMPING = (1e-3, 1e-7, 1e6)
@@ -72,7 +73,7 @@ def minimise(
                 trial = moved(shape, envelope, *factorised.step(inner))
                 after = total_cost(measurements, trial, lagged)
                 if closely and before < after < np.inf:
-                    missed = _missed(measurements, shape, trial, equations.border)
+                    missed = _missed(measurements, shape, trial, equations)
                     trial = moved(trial, envelope, *factorised.correction(missed, inner))
                     after = total_cost(measurements, trial, lagged)
             except ComputationError:
@@ -91,23 +92,25 @@ def minimise(
     return shape, history
 
 
-def _missed(measurements: Measurements, shape: Shape, trial: Shape, border: np.ndarray) -> np.ndarray:
-    """(F, E) by how much log chords change more than their derivatives at a shape say."""
-    i, k = measurements.mesh.edges.T
-    chords = []
+def _missed(measurements: Measurements, shape: Shape, trial: Shape, equations: NormalEquations) -> np.ndarray:
+    """(F, E) by how much log chords less stretches change more than their derivatives at a shape say."""
+    mesh, border = measurements.mesh, equations.border
+    i, k = mesh.edges.T
+    lengths = []
     for each in (shape, trial):
         points = each.points(measurements.image)
         square = ((points[:, i] - points[:, k]) ** 2).sum(axis=-1)
-        chords.append(0.5 * np.log(np.maximum(square, _COINCIDENT)))
+        lengths.append(0.5 * np.log(np.maximum(square, _COINCIDENT)) - stretches(each.strain, mesh.direction)[0])
     depth = (trial.log_depth - shape.log_depth)[..., None]
     step = np.concatenate([depth, trial.correction - shape.correction], axis=-1)
     m = border.shape[-1] // 2
     linear = (border[..., :3] * step[:, i]).sum(axis=-1) + (border[..., m : m + 3] * step[:, k]).sum(axis=-1)
-    return np.asarray(chords[1] - chords[0] - linear)
+    linear -= np.einsum("fek,fk->fe", equations.by_strain, trial.strain - shape.strain)
+    return np.asarray(lengths[1] - lengths[0] - linear)
 
 
 def fit_views(measurements: Measurements, shape: Shape, iterations: int, tolerance: float) -> tuple[Shape, np.ndarray]:
-    """Each view on its own, lengths held, until an iteration lowers its cost by less than `tolerance` of it.
+    """Each view on its own, lengths and strains held, until an iteration lowers its cost by less than this part of it.
 
     Returns:
         The shape and the (F,) costs.
@@ -124,6 +127,7 @@ def fit_views(measurements: Measurements, shape: Shape, iterations: int, toleran
         measurements.length_weight,
         measurements.factor_weight,
         mesh.triangles,
+        stretches(shape.strain, mesh.direction)[0],
         terms_of(measurements, shape, stencils_of(measurements, shape)),
         envelope,
         iterations,

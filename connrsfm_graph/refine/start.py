@@ -59,4 +59,5 @@ def start_shape(completed: Completed, mesh: Mesh, conformal: bool = False) -> Sh
         correction=np.zeros((F, P, 2)),
         log_factor=np.zeros((F, P if conformal else 0)),
         log_length=length - unit,
+        strain=np.zeros((F, 0)),
     )

@@ -51,6 +51,10 @@ class Task:
         """(F,) bool, views declared isometric to each other."""
         return np.isin(np.arange(len(self.seen)), self.config.isometric_views)
 
+    def flat(self) -> Task:
+        """The same from flat views in front of the camera."""
+        return replace(self, completed=replace(self.completed, log_depth=np.zeros_like(self.completed.log_depth)))
+
     def spacing(self) -> float:
         """Median image length of the near edges."""
         near = self.mesh.edges[: self.mesh.n_near]
@@ -68,6 +72,7 @@ class Task:
             log_length_weight=np.full(len(start.log_length), 0.0 if conformal else noise.prior),
             length_weight=np.full((len(self.seen), len(self.mesh.edges)), 1.0 / noise.length),
             factor_weight=np.where(self.declared & declared, _DECLARED_FACTOR, _FACTOR),
+            strain_weight=1.0 / config.strain_sigma,
             mesh=self.mesh,
             weights=Weights(
                 huber=noise.huber,

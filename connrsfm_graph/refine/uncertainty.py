@@ -80,7 +80,7 @@ def _variance_of_all(
         noise = lengths / measurements.length_weight
         gradient = -factorised.spread(noise)
         gradient[..., rays] += measurements.image_weight[..., None] * images
-        views, _ = factorised.solve(gradient, -(equations.weight * noise).sum(axis=1), _TOLERANCE)
+        views, _ = factorised.solve(gradient, factorised.border_part(-equations.weight * noise), _TOLERANCE)
         error = views[..., envelope.unknown]
         if about_mean:
             error = error - error.mean(axis=-1, keepdims=True)

@@ -109,11 +109,13 @@ def from_lengths(start: View, keyframes: list[View], image_sigma: float, length_
         log_length_weight=np.zeros(len(mesh.edges)),
         length_weight=np.tile(weight, (len(depths), 1)),
         factor_weight=np.ones(len(depths)),
+        strain_weight=0.0,
         mesh=mesh,
         weights=_WEIGHTS,
     )
     N = len(start.points)
-    shape = Shape(depths, np.zeros((len(depths), N, 2)), np.empty((len(depths), 0)), log_length(mesh.edges))
+    none = np.empty((len(depths), 0))
+    shape = Shape(depths, np.zeros((len(depths), N, 2)), none, log_length(mesh.edges), none)
     shape, cost = fit_views(measurements, shape, _ITERATIONS, _TOLERANCE)
     best = np.array([cost.argmin()])
     deviation = log_depth_deviation(measurements.views(best), shape.views(best), stretch=False, jointly=False)

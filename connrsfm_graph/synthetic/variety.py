@@ -1,7 +1,7 @@
 """A variety of scenes: surfaces of many kinds, cameras at rest or moving, sizes, noise and gaps all drawn at random.
 
 No two seeds are alike, so that a method is seen on what it was not made for. Rolls, waves, cones and planes are paper,
-which keeps its lengths; cloth, tissue and balloons stretch by a few per cent.
+which keeps its lengths; cloth, tissue and balloons stretch by a few per cent, rubber as a whole by up to a half.
 """
 
 from __future__ import annotations
@@ -25,6 +25,8 @@ _MISSING = 0.4
 """Largest part of the observations that is missing, where some are."""
 _STIFF = ("plane", "rigid")
 """Kinds that tell nothing before a camera at rest."""
+_POISSON = 0.4
+"""By how much rubber gets narrower as it gets longer, in logarithms."""
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
 
 Surface = Callable[[Jet, Jet, np.ndarray], Jet]
@@ -147,6 +149,20 @@ def _balloon(rng: np.random.Generator) -> Surface:
     return surface
 
 
+def _rubber(rng: np.random.Generator) -> Surface:
+    """A roll that is pulled along one direction, longer by up to a half and narrower with it."""
+    bend, axis, pull, most = rng.uniform(0.2, 0.8), *rng.uniform(0.0, np.pi, 2), rng.uniform(0.1, 0.5)
+
+    def surface(s: Jet, t: Jet, motion: np.ndarray) -> Jet:
+        longer = 1.0 + 0.5 * most * (1.0 + motion[1])
+        along, across = s * np.cos(pull) + t * np.sin(pull), t * np.cos(pull) - s * np.sin(pull)
+        along, across = along * longer, across * longer**-_POISSON
+        pulled = along * np.cos(pull) - across * np.sin(pull), along * np.sin(pull) + across * np.cos(pull)
+        return rolled(pulled, bend * motion[0], axis)
+
+    return surface
+
+
 def _rigid(rng: np.random.Generator) -> Surface:
     """A relief that only moves."""
     cloth = _cloth(rng)
@@ -162,5 +178,6 @@ KINDS: dict[str, Callable[[np.random.Generator], Surface]] = {
     "tissue": _tissue,
     "balloon": _balloon,
     "rigid": _rigid,
+    "rubber": _rubber,
 }
 """Kinds of surfaces; one more entry adds one."""

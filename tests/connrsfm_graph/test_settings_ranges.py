@@ -29,6 +29,8 @@ from connrsfm_graph.reconstruct import Config
         "warps.min_points=1",
         "refine.length_sigma=-1",
         "refine.rings=7",
+        "refine.stretched=maybe",
+        "refine.strain_sigma=0",
         "refine.frontal_patches=[0, 10]",
         "refine.frontal_patches=[30, 10]",
         "refine.length_sigma=inf",

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.linalg import expm
 
 from factors.bending import bending_factor, hinge_coefficients
-from factors.edge_length import EdgeLength, arc_offset, edge_length_factor
+from factors.edge_length import EdgeLength, arc_offset, edge_length_factor, stretch_kernel
 from factors.image_point import image_point_factor
 from factors.keys import LOG_DEPTH, LOG_LENGTH, RAY_CORRECTION, key
 from factors.scale_smoothness import scale_smoothness_factor
@@ -43,6 +44,19 @@ def test_inverting_a_view_about_the_camera_centre_changes_no_conformal_residual(
     before = factor.residual(*_variables(points, image), e, *f)
     after = factor.residual(*_variables(points / squared, image), e, *(f - np.log(squared)))
     assert after == pytest.approx(before, abs=1e-12)
+
+
+@given(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0), st.floats(0.0, np.pi))
+def test_a_strain_stretches_edges_as_the_matrix_exponential_does(a, b, angle):
+    edge = np.array([np.cos(angle), np.sin(angle)])
+    stretched = expm(np.array([[a, b], [b, -a]])) @ edge
+    change, _, _ = stretch_kernel(a, b, np.cos(2 * angle), np.sin(2 * angle))
+    assert change == pytest.approx(np.log(np.linalg.norm(stretched)), abs=1e-9)
+
+
+def test_an_edge_is_compared_up_to_conformal_factors_or_a_strain_not_both():
+    with pytest.raises(ValueError, match="up to conformal factors or up to a strain, not both"):
+        edge_length_factor(0, 0, 1, 0, np.zeros(2), np.ones(2), UNIT(1), conformal=True, direction=(1.0, 0.0))
 
 
 @pytest.mark.parametrize("angle", [0.05, 0.2, 0.4])

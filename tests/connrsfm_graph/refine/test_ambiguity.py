@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -21,10 +23,10 @@ def true_shape(scene: Scene, rings: int = 1) -> tuple[Measurements, Shape]:
     mesh = start_mesh(completed, seen, rings)
     factor = scene.log_size - scene.log_size.mean(axis=1, keepdims=True)
     log_depth = scene.log_depth - scene.log_size.mean(axis=1, keepdims=True)
-    shape = Shape(log_depth, np.zeros((*seen.shape, 2)), factor, np.zeros(len(mesh.edges)))
+    shape = Shape(log_depth, np.zeros((*seen.shape, 2)), factor, np.zeros(len(mesh.edges)), np.zeros((len(seen), 0)))
     a, b = mesh.edges.T
     residual = log_chords(shape.points(scene.image), mesh.edges) - 0.5 * (factor[:, a] + factor[:, b])
-    shape = Shape(log_depth, shape.correction, factor, np.median(residual, axis=0))
+    shape = replace(shape, log_length=np.median(residual, axis=0))
     measurements = Measurements(
         image=scene.image,
         image_weight=np.ones(seen.shape),
@@ -33,6 +35,7 @@ def true_shape(scene: Scene, rings: int = 1) -> tuple[Measurements, Shape]:
         log_length_weight=np.zeros(len(mesh.edges)),
         length_weight=np.full(residual.shape, 100.0),
         factor_weight=np.zeros(len(seen)),
+        strain_weight=0.0,
         mesh=mesh,
         weights=Weights(huber=1e9, bending=0.0, smoothness=0.0, drift=0.0, unit=0.0, frontal=0.0),
     )

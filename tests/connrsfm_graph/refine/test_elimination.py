@@ -20,13 +20,17 @@ from factors.bending import Bending
 from factors.edge_length import edge_length_factor
 from factors.frontal import frontal_factor
 from factors.image_point import image_point_factor
-from factors.keys import LOG_DEPTH, LOG_FACTOR, LOG_LENGTH, RAY_CORRECTION, key
+from factors.keys import LOG_DEPTH, LOG_FACTOR, LOG_LENGTH, RAY_CORRECTION, STRAIN, key
 from factors.scale_smoothness import scale_smoothness_factor
 
 F, P = 3, 9
+MODELS = [(False, False), (True, False), (False, True)]
+"""Conformal, strained."""
 
 
-def _random_problem(conformal: bool, bending: bool, seed: int = 0, frontal: float = 0.7) -> tuple[Measurements, Shape]:
+def _random_problem(
+    conformal: bool, bending: bool, seed: int = 0, frontal: float = 0.7, strained: bool = False
+) -> tuple[Measurements, Shape]:
     rng = np.random.default_rng(seed)
     image = rng.uniform(-0.5, 0.5, (1, P, 2)) + rng.normal(0, 0.05, (F, P, 2))
     mesh = surface_mesh(image[0], lambda edges: np.zeros(len(edges)))
@@ -36,6 +40,7 @@ def _random_problem(conformal: bool, bending: bool, seed: int = 0, frontal: floa
         rng.normal(0, 0.01, (F, P, 2)),
         rng.normal(0, 0.1, (F, P if conformal else 0)),
         rng.normal(-0.7, 0.3, E),
+        rng.normal(0, 0.2, (F, 2 if strained else 0)),
     )
     measurements = Measurements(
         image=image,
@@ -45,6 +50,7 @@ def _random_problem(conformal: bool, bending: bool, seed: int = 0, frontal: floa
         log_length_weight=rng.uniform(2, 5, E),
         length_weight=rng.uniform(5, 10, (F, E)),
         factor_weight=rng.uniform(0.1, 1, F),
+        strain_weight=4.0,
         mesh=mesh,
         weights=Weights(huber=1.0, bending=0.5 * bending, smoothness=5.0, drift=1.0, unit=0.0, frontal=frontal),
     )
@@ -57,7 +63,7 @@ def _graph(
     """All factors; the residuals of lengths `more` (F, E) than they are."""
     more = np.broadcast_to(more, (F, len(shape.log_length)))
     mesh, weights, lagged = measurements.mesh, measurements.weights, lag(measurements, shape)
-    conformal = shape.log_factor.size > 0
+    conformal, strained = shape.log_factor.size > 0, shape.strain.size > 0
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
 
     def sigma(dimension: int, weight: float) -> gtsam.noiseModel.Isotropic:
@@ -73,6 +79,10 @@ def _graph(
         )
     for j in range(F):
         image = measurements.image[j]
+        if strained:
+            values.insert(key(STRAIN, 0, j), shape.strain[j])
+            prior = sigma(2, measurements.strain_weight)
+            graph.add(gtsam.PriorFactorVector(key(STRAIN, 0, j), np.zeros(2), prior))
         for i in range(P):
             values.insert(key(LOG_DEPTH, i, j), shape.log_depth[j, i : i + 1])
             values.insert(key(RAY_CORRECTION, i, j), shape.correction[j, i])
@@ -86,7 +96,8 @@ def _graph(
         for e, (i, k) in enumerate(mesh.edges):
             noise = gtsam.noiseModel.Robust.Create(loss, sigma(1, measurements.length_weight[j, e]))
             offset = lagged.offset[j, e] + more[j, e]
-            graph.add(edge_length_factor(e, i, k, j, image[i], image[k], noise, offset, conformal))
+            direction = tuple(mesh.direction[e]) if strained else None
+            graph.add(edge_length_factor(e, i, k, j, image[i], image[k], noise, offset, conformal, direction))
             graph.add(frontal_factor(e, i, k, j, image[i], image[k], weights.frontal))
             if conformal and e < mesh.n_near:
                 graph.add(scale_smoothness_factor(i, k, j, sigma(1, weights.smoothness)))
@@ -97,11 +108,11 @@ def _graph(
     return graph, values
 
 
-@pytest.mark.parametrize("conformal", [False, True])
+@pytest.mark.parametrize(("conformal", "strained"), MODELS)
 @pytest.mark.parametrize("bending", [False, True])
 @pytest.mark.parametrize("frontal", [0.0, 0.7])
-def test_cost_and_step_equal_gtsams(conformal, bending, frontal):
-    measurements, shape = _random_problem(conformal, bending, frontal=frontal)
+def test_cost_and_step_equal_gtsams(conformal, strained, bending, frontal):
+    measurements, shape = _random_problem(conformal, bending, frontal=frontal, strained=strained)
     graph, values = _graph(measurements, shape)
     lagged = lag(measurements, shape)
     assert total_cost(measurements, shape, lagged) == pytest.approx(graph.error(values), rel=1e-12)
@@ -118,11 +129,13 @@ def test_cost_and_step_equal_gtsams(conformal, bending, frontal):
                 assert ours.log_factor[j, i] == pytest.approx(theirs.atVector(key(LOG_FACTOR, i, j))[0], abs=1e-10)
     for e in range(len(shape.log_length)):
         assert ours.log_length[e] == pytest.approx(theirs.atVector(key(LOG_LENGTH, e))[0], abs=1e-10)
+    for j in range(F * strained):
+        assert ours.strain[j] == pytest.approx(theirs.atVector(key(STRAIN, 0, j)), abs=1e-10)
 
 
-@pytest.mark.parametrize("conformal", [False, True])
-def test_a_correction_is_by_what_gtsams_step_changes(conformal):
-    measurements, shape = _random_problem(conformal, bending=True)
+@pytest.mark.parametrize(("conformal", "strained"), MODELS)
+def test_a_correction_is_by_what_gtsams_step_changes(conformal, strained):
+    measurements, shape = _random_problem(conformal, bending=True, strained=strained)
     measurements = replace(measurements, weights=measurements.weights._replace(huber=1e9))
     missed = np.random.default_rng(1).normal(0, 0.1, (F, len(shape.log_length)))
     steps = []
@@ -142,36 +155,40 @@ def test_a_correction_is_by_what_gtsams_step_changes(conformal):
         length = key(LOG_LENGTH, e)
         expected = shape.log_length[e] + (steps[0].at(length) - steps[1].at(length))[0]
         assert ours.log_length[e] == pytest.approx(expected, abs=1e-10)
+    for j in range(F * strained):
+        strain = key(STRAIN, 0, j)
+        assert ours.strain[j] == pytest.approx(shape.strain[j] + steps[0].at(strain) - steps[1].at(strain), abs=1e-10)
 
 
-@pytest.mark.parametrize("conformal", [False, True])
-def test_what_a_step_misses_is_of_second_order(conformal):
-    measurements, shape = _random_problem(conformal, bending=False)
+@pytest.mark.parametrize(("conformal", "strained"), MODELS)
+def test_what_a_step_misses_is_of_second_order(conformal, strained):
+    measurements, shape = _random_problem(conformal, bending=False, strained=strained)
     envelope = measurements.envelope(conformal)
     equations, _ = linearise(measurements, shape, lag(measurements, shape), envelope)
     direction = np.random.default_rng(2).normal(0, 1e-3, equations.gradient.shape)
     sizes = []
     for part in (1.0, 0.5):
-        trial = moved(shape, envelope, part * direction, part)
-        sizes.append(np.abs(solve._missed(measurements, shape, trial, equations.border)))
+        trial = moved(shape, envelope, part * direction, 1e-3 * part)
+        sizes.append(np.abs(solve._missed(measurements, shape, trial, equations)))
     assert sizes[0].max() > 1e-8
     assert np.median(sizes[0] / sizes[1]) == pytest.approx(4.0, rel=0.05)
 
 
-def test_the_schur_complement_is_symmetric_and_positive_definite():
-    measurements, shape = _random_problem(conformal=True, bending=True, seed=1)
+@pytest.mark.parametrize(("conformal", "strained"), MODELS)
+def test_the_schur_complement_is_symmetric_and_positive_definite(conformal, strained):
+    measurements, shape = _random_problem(conformal, bending=True, seed=1, strained=strained)
     measurements = replace(measurements, weights=measurements.weights._replace(unit=10.0))
-    envelope = measurements.envelope(True)
+    envelope = measurements.envelope(conformal)
     equations, _ = linearise(measurements, shape, lag(measurements, shape), envelope)
     factorised = Factorised(equations, envelope, measurements.mesh.edges, damping=0.1)
-    S = factorised.schur_product(np.eye(len(measurements.mesh.edges)))
+    S = factorised.schur_product(np.eye(len(measurements.mesh.edges) + shape.strain.size))
     assert pytest.approx(S.T, abs=1e-9 * np.abs(S).max()) == S
     assert np.linalg.eigvalsh(S).min() > 0
 
 
-@pytest.mark.parametrize("conformal", [False, True])
-def test_views_fitted_one_by_one_take_the_steps_of_the_whole_problem_with_lengths_held(conformal):
-    measurements, shape = _random_problem(conformal, bending=True, seed=2)
+@pytest.mark.parametrize(("conformal", "strained"), MODELS)
+def test_views_fitted_one_by_one_take_the_steps_of_the_whole_problem_with_lengths_held(conformal, strained):
+    measurements, shape = _random_problem(conformal, bending=True, seed=2, strained=strained)
     envelope, lagged = measurements.envelope(conformal), lag(measurements, shape)
     equations, _ = linearise(measurements, shape, lagged, envelope)
     factorised = Factorised(equations, envelope, measurements.mesh.edges, damping=1e-3)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from connrsfm_graph.refine import RefineConfig
-from connrsfm_graph.refine.measurements import Shape
 from connrsfm_graph.refine.noise import Noise
 from connrsfm_graph.refine.restarts import restart
 from connrsfm_graph.refine.solve import fit_views, minimise
@@ -41,7 +42,7 @@ def test_a_part_taken_for_its_mirror_image_is_turned_back() -> None:
     x = scene.image[2, :, 0]
     middle = log_depth[2, np.abs(x).argmin()]
     log_depth[2, x > 0] = 2.0 * middle - log_depth[2, x > 0]
-    caught = Shape(log_depth, true.correction, true.log_factor, true.log_length)
+    caught = replace(true, log_depth=log_depth)
     caught, stuck = fit_views(measurements, caught, 50, 1e-4)
     _, right = fit_views(measurements, true, 50, 1e-4)
     assert stuck[2] > 5.0 * right[2], "the wrong surface is a minimum of its own"

@@ -38,6 +38,13 @@ def test_what_stretches_does_so_a_little(kind: str) -> None:
     assert max(stretch) < 0.8
 
 
+def test_rubber_is_pulled_as_a_whole() -> None:
+    for seed in range(4):
+        forms = metrics("rubber", seed)
+        np.testing.assert_allclose(forms, forms[..., :1].repeat(50, axis=-1), atol=1e-7)
+        assert np.ptp(forms[..., 0], axis=0).max() > 0.05
+
+
 def test_what_is_rigid_only_moves() -> None:
     form = metrics("rigid", 0)
     np.testing.assert_allclose(form, form[:1].repeat(3, axis=0), atol=1e-12)

@@ -1,0 +1,110 @@
+"""Views that are pulled as a whole along one direction: isometric but for a homogeneous strain of each view.
+
+Cloth under tension and rubber stretch more along one direction than along the other, and by so much that lengths
+cannot be shared: taken for isometric, a pull looks like a tilt. Two numbers for each view explain it (see
+`factors.edge_length.stretch_kernel`), so few that the shared lengths and the perspective tell them from a tilt. Strains
+that vary over the surface are not told: polynomials of them fit better and reconstruct worse.
+
+Directions on the surface are at first those in the image that the mesh was made in, then those of the surface laid out
+flat.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from connrsfm_graph.refine.caught import reseated_where_dear, restarted_where_dear
+from connrsfm_graph.refine.flatten import flattened
+from connrsfm_graph.refine.measurements import Shape
+from connrsfm_graph.refine.noise import Noise
+from connrsfm_graph.refine.settle import BEYOND_DOUBT, settled
+from connrsfm_graph.refine.start import log_chords, start_shape
+from connrsfm_graph.refine.task import Fit, Task, minimised
+
+_PROMISING = 1.2
+"""Strains must lower the cost by this factor to be looked into: of what is isometric or stretches otherwise they lower
+it by a tenth or two."""
+_ENOUGH, _PLENTY = 1.3, 3.0
+"""By the first factor where the ray corrections then look like noise, else by the second."""
+_PULLED = (0.0, 0.5)
+"""Parts of what distinguishes the images of flat views that are taken for pulls at the start."""
+_RIVAL = 1.2
+"""Views that are caught in a wrong shape start again in fits that cost up to this many times the cheapest."""
+_ROUNDS = 4
+"""So often surfaces are laid out flat by what was found, at most."""
+_WORTH = 0.9
+"""As long as that lowers the cost to this part."""
+
+
+def stretched(task: Task, found: Fit, noise: Noise) -> tuple[Task, Fit]:
+    """A settled isometric fit, or that of views with a homogeneous strain where it is by far the better one.
+
+    Strains are tried where ray corrections do not look like noise. Where the search for them comes upon a better
+    isometric fit, that one is taken.
+
+    Args:
+        task: what is to be fitted.
+        found: the settled isometric fit.
+        noise: the noise levels under which its first cost was.
+
+    Returns:
+        The task, of strained views with a mesh that is laid out flat, and the fit.
+    """
+    wanted = task.config.stretched
+    if wanted == "no" or (wanted == "auto" and (found.noisy or found.misfit() < BEYOND_DOUBT)):
+        return task, found
+    own, best = task, _cheapest(task, replace(found, noise=noise))
+    found.evidence["isometric over stretched cost"] = found.first_cost / max(best.first_cost, 1e-300)
+    if wanted == "auto" and found.first_cost < _PROMISING * best.first_cost:
+        return task, found
+    for _ in range(_ROUNDS):
+        mesh, completed = flattened(task.mesh, best.shape.log_length), task.completed
+        again = replace(task, mesh=mesh, completed=replace(completed, log_depth=best.shape.log_depth))
+        trial = _cheapest(again, best)
+        if trial.first_cost > _WORTH * best.first_cost:
+            break
+        own, best = again, trial
+    isometric = _minimum(own, best, replace(best.shape, strain=best.shape.strain[:, :0]))
+    ratio = isometric.first_cost / max(best.first_cost, 1e-300)
+    found.evidence["isometric over stretched cost"] = ratio
+    strained = settled(own, best)
+    if wanted == "auto" and ratio < (_ENOUGH if strained.noisy else _PLENTY):
+        other = _minimum(task, isometric, isometric.shape)
+        return task, settled(task, other) if other.first_cost < found.first_cost else found
+    strained.evidence["strain of views"] = strained.shape.strain.tolist()
+    return own, strained
+
+
+def _cheapest(task: Task, found: Fit) -> Fit:
+    """The cheapest of the fits with strains from several starts."""
+    fits = [_minimum(task, found, start) for start in _starts(task, found)]
+    most = _RIVAL * min(fit.first_cost for fit in fits)
+    rivals = [fit for fit in fits if fit.first_cost <= most]
+    fits = [reseated_where_dear(task, restarted_where_dear(task, fit, lend=True)) for fit in rivals]
+    return min(fits, key=lambda fit: fit.first_cost)
+
+
+def _minimum(task: Task, found: Fit, start: Shape) -> Fit:
+    """A fit from another start, under the noise levels of one that was found."""
+    measurements = task.measurements(found.noise, conformal=False)
+    shape, history = minimised(task, measurements, start)
+    return replace(
+        found, measurements=measurements, shape=shape, history=found.history + history, first_cost=history[-1]
+    )
+
+
+def _starts(task: Task, found: Fit) -> Iterator[Shape]:
+    """The fit; and, since one that takes pulls for tilts may be far off, flat views that are pulled more or less."""
+    F, E = len(found.shape.log_depth), len(task.mesh.edges)
+    none = np.zeros((F, 2))
+    yield found.shape if found.shape.strain.size else replace(found.shape, strain=none)
+    flat = task.flat().completed
+    shape = start_shape(flat, task.mesh)
+    residual = log_chords(shape.points(flat.image), task.mesh.edges) - shape.log_length
+    rows = np.concatenate([task.mesh.direction, np.ones((E, 1))], axis=1)
+    pull = (residual @ np.linalg.pinv(rows).T)[:, :2]
+    for part in _PULLED:
+        yield replace(shape, strain=part * (pull - pull.mean(axis=0)))
