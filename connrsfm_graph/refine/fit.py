@@ -40,8 +40,9 @@ def fit(task: Task, sigma_image: float) -> Fit:
     wanted = task.config.model
     if wanted == "conformal":
         return fit_conformal(task, noise)
-    own, isometric = stretched(task, fit_isometric(task, noise), noise)
-    misfit = isometric.misfit()
+    isometric = fit_isometric(task, noise)
+    misfit = isometric.misfit()  # without strains, which explain a part of what is conformal
+    own, isometric = stretched(task, isometric, noise)
     isometric.evidence["isometric misfit"] = misfit
     if wanted == "isometric" or misfit <= _MISFIT:
         return _finished(own, isometric)

@@ -31,8 +31,6 @@ _ENOUGH, _PLENTY = 1.3, 3.0
 """By the first factor where the ray corrections then look like noise, else by the second."""
 _PULLED = (0.0, 0.5)
 """Parts of what distinguishes the images of flat views that are taken for pulls at the start."""
-_RIVAL = 1.2
-"""Views that are caught in a wrong shape start again in fits that cost up to this many times the cheapest."""
 _ROUNDS = 4
 """So often surfaces are laid out flat by what was found, at most."""
 _WORTH = 0.9
@@ -63,7 +61,7 @@ def stretched(task: Task, found: Fit, noise: Noise) -> tuple[Task, Fit]:
     for _ in range(_ROUNDS):
         mesh, completed = flattened(task.mesh, best.shape.log_length), task.completed
         again = replace(task, mesh=mesh, completed=replace(completed, log_depth=best.shape.log_depth))
-        trial = _cheapest(again, best)
+        trial = _cheapest(again, best) if own is task else _minimum(again, best, best.shape)
         if trial.first_cost > _WORTH * best.first_cost:
             break
         own, best = again, trial
@@ -79,12 +77,9 @@ def stretched(task: Task, found: Fit, noise: Noise) -> tuple[Task, Fit]:
 
 
 def _cheapest(task: Task, found: Fit) -> Fit:
-    """The cheapest of the fits with strains from several starts."""
-    fits = [_minimum(task, found, start) for start in _starts(task, found)]
-    most = _RIVAL * min(fit.first_cost for fit in fits)
-    rivals = [fit for fit in fits if fit.first_cost <= most]
-    fits = [reseated_where_dear(task, restarted_where_dear(task, fit, lend=True)) for fit in rivals]
-    return min(fits, key=lambda fit: fit.first_cost)
+    """The cheapest of the fits with strains from several starts; views that are caught in a wrong shape start again."""
+    best = min((_minimum(task, found, start) for start in _starts(task, found)), key=lambda fit: fit.first_cost)
+    return reseated_where_dear(task, restarted_where_dear(task, best, lend=True))
 
 
 def _minimum(task: Task, found: Fit, start: Shape) -> Fit:
