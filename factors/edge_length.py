@@ -183,16 +183,17 @@ def examples(rng: np.random.Generator) -> Iterator[Example]:
     """Isometric, conformal and strained factors at random points, for the Jacobian check."""
     angle = rng.uniform(0.0, 2.0 * np.pi)
     along = (float(np.cos(angle)), float(np.sin(angle)))
-    for name, direction, size in (
-        ("isometric", None, 0.2),
-        ("conformal", None, 0.2),
-        ("strained", along, 0.2),
-        ("hardly strained", along, 1e-3),
+    for name, direction, last, size in (
+        ("isometric", None, (), 0.2),
+        ("conformal", None, (1, 1), 0.2),
+        ("strained", along, (2,), 0.2),
+        ("hardly strained", along, (2,), 1e-3),
     ):
         noise = gtsam.noiseModel.Isotropic.Sigma(1, 0.3)
         image_i, image_k = rng.normal(0, 0.4, (2, 2))
         factor = edge_length_factor(2, 0, 1, 3, image_i, image_k, noise, 0.01, name == "conformal", direction)
         values = gtsam.Values()
-        for k, dim in zip(factor.keys(), (1, 2, 1, 2, 1, 1 if direction is None else 2, 1), strict=False):
-            values.insert(k, rng.normal(0.0, 0.2 if len(values.keys()) < 5 else size, dim))
+        deviations = [np.full(dim, 0.2) for dim in (1, 2, 1, 2, 1)] + [np.full(dim, size) for dim in last]
+        for k, deviation in zip(factor.keys(), deviations, strict=True):
+            values.insert(k, rng.normal(0.0, deviation))
         yield name, factor, values

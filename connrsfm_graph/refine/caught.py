@@ -11,7 +11,7 @@ from connrsfm_graph.refine.reseat import reseat
 from connrsfm_graph.refine.restarts import restart
 from connrsfm_graph.refine.task import Fit, Task, minimised
 
-_RESTARTS = 4
+RESTARTS = 4
 """Rounds of restarts, at most."""
 _SUSPECT = (1.5, 0.02)
 """So may one be that costs so many times the lower quartile of the views, and so much per edge."""
@@ -21,7 +21,7 @@ def restarted_where_dear(task: Task, found: Fit, lend: bool = False) -> Fit:
     """The fit with views that cost more than others restarted until none gains; `lend` says whether also from the
     surfaces of those others."""
     measurements = found.measurements
-    for _ in range(_RESTARTS):
+    for _ in range(RESTARTS):
         suspect = _suspect(measurements, found.shape)
         if len(suspect) == 0:
             break
@@ -43,7 +43,7 @@ def _suspect(measurements: Measurements, shape: Shape) -> np.ndarray:
 
 def reseated_where_dear(task: Task, found: Fit) -> Fit:
     """The fit with single points elsewhere in views that still cost more than others, as long as that pays."""
-    for _ in range(_RESTARTS):
+    for _ in range(RESTARTS):
         suspect = _suspect(found.measurements, found.shape)
         if len(suspect) == 0:
             break

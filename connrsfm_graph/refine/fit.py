@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from connrsfm_graph.refine.ambiguity import resolve
-from connrsfm_graph.refine.caught import reseated_where_dear, restarted_where_dear
+from connrsfm_graph.refine.caught import RESTARTS, reseated_where_dear, restarted_where_dear
 from connrsfm_graph.refine.measurements import Measurements, Shape
 from connrsfm_graph.refine.noise import Noise
 from connrsfm_graph.refine.restarts import inverted, restart
@@ -17,8 +17,6 @@ from connrsfm_graph.refine.start import start_shape
 from connrsfm_graph.refine.strain import stretched
 from connrsfm_graph.refine.task import Fit, Task, minimised
 
-_RESTARTS = 4
-"""Rounds of restarts, at most."""
 _PROMISING = 2.0
 """Views of a second fit are restarted where it costs at most this many times the first."""
 _MISFIT = 1.0
@@ -123,7 +121,7 @@ def fit_conformal(task: Task, noise: Noise) -> Fit:
 def _restarted(task: Task, measurements: Measurements, shape: Shape) -> tuple[Shape, list[float]]:
     """Minimum from a shape, all views restarted until none gains, and the costs on the way."""
     shape, history = minimised(task, measurements, shape)
-    for _ in range(_RESTARTS):
+    for _ in range(RESTARTS):
         shape, renewed = restart(measurements, shape)
         if not renewed.any():
             break

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 from scipy import sparse
+from scipy.sparse import csgraph
 from scipy.sparse.linalg import splu
 
 from connrsfm_graph.refine.mesh import Mesh
@@ -40,7 +41,5 @@ def flattened(mesh: Mesh, log_length: np.ndarray) -> Mesh:
 
 def _laplacian(mesh: Mesh, weight: np.ndarray) -> sparse.csr_array:
     """(P, P) graph Laplacian of the edges with weights (E,)."""
-    i, k = mesh.edges.T
-    one_way = sparse.coo_array((weight, (i, k)), shape=(mesh.n_points, mesh.n_points)).tocsr()
-    both = one_way + one_way.T
-    return (sparse.diags_array(both.sum(axis=1)) - both).tocsr()
+    graph = sparse.coo_array((weight, tuple(mesh.edges.T)), shape=(mesh.n_points, mesh.n_points))
+    return csgraph.laplacian(graph.tocsr(), symmetrized=True)

@@ -156,7 +156,7 @@ def linearise(
     over_views(linearise_kernel, F, *arguments, envelope, matrix, gradient, border, residual, weight)
     unit, frontal = measurements.weights.unit, measurements.weights.frontal
     prior = measurements.log_length_weight**2
-    _, by_strain = stretches(shape.strain, measurements.mesh.direction)
+    _, by_strain = stretches(shape.strain, measurements.mesh)
     held = measurements.strain_weight**2
     equations = NormalEquations(
         matrix=matrix,
@@ -178,7 +178,7 @@ def linearise(
 
 def kernel_arguments(measurements: Measurements, shape: Shape, lagged: Lagged) -> tuple:
     """What the kernels of the cost ask for."""
-    change, _ = stretches(shape.strain, measurements.mesh.direction)
+    change, _ = stretches(shape.strain, measurements.mesh)
     return (
         shape.points(measurements.image),
         shape.log_factor,

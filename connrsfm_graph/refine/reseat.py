@@ -42,7 +42,7 @@ def reseated(measurements: Measurements, shape: Shape) -> Shape:
     """
     edges = measurements.mesh.edges
     point, other = np.concatenate([edges, edges[:, ::-1]]).T  # every edge from either end
-    stretch, _ = stretches(shape.strain, measurements.mesh.direction)
+    stretch, _ = stretches(shape.strain, measurements.mesh)
     wanted = np.tile(shape.log_length + stretch - lag(measurements, shape).offset, 2)
     weight = np.tile(measurements.length_weight, 2)
     X = shape.points(measurements.image)

@@ -154,7 +154,7 @@ def _folded(shape: Shape, ray: np.ndarray) -> Iterator[Shape]:
 def _scaled(measurements: Measurements, shape: Shape) -> Shape:
     """Every view scaled so that the median of its length residuals is zero."""
     edges = measurements.mesh.edges
-    length = shape.log_length + stretches(shape.strain, measurements.mesh.direction)[0]
+    length = shape.log_length + stretches(shape.strain, measurements.mesh)[0]
     residual = log_chords(shape.points(measurements.image), edges) - length
     if shape.log_factor.size:
         residual -= 0.5 * (shape.log_factor[:, edges[:, 0]] + shape.log_factor[:, edges[:, 1]])

@@ -100,7 +100,7 @@ def _missed(measurements: Measurements, shape: Shape, trial: Shape, equations: N
     for each in (shape, trial):
         points = each.points(measurements.image)
         square = ((points[:, i] - points[:, k]) ** 2).sum(axis=-1)
-        lengths.append(0.5 * np.log(np.maximum(square, _COINCIDENT)) - stretches(each.strain, mesh.direction)[0])
+        lengths.append(0.5 * np.log(np.maximum(square, _COINCIDENT)) - stretches(each.strain, mesh)[0])
     depth = (trial.log_depth - shape.log_depth)[..., None]
     step = np.concatenate([depth, trial.correction - shape.correction], axis=-1)
     m = border.shape[-1] // 2
@@ -110,7 +110,12 @@ def _missed(measurements: Measurements, shape: Shape, trial: Shape, equations: N
 
 
 def fit_views(measurements: Measurements, shape: Shape, iterations: int, tolerance: float) -> tuple[Shape, np.ndarray]:
-    """Each view on its own, lengths and strains held, until an iteration lowers its cost by less than this part of it.
+    """Each view on its own, lengths and strains held.
+
+    Args:
+        measurements, shape: as in `minimise`.
+        iterations: at most so many.
+        tolerance: a view's fit ends where an iteration lowers its cost by less than this part.
 
     Returns:
         The shape and the (F,) costs.
@@ -127,7 +132,7 @@ def fit_views(measurements: Measurements, shape: Shape, iterations: int, toleran
         measurements.length_weight,
         measurements.factor_weight,
         mesh.triangles,
-        stretches(shape.strain, mesh.direction)[0],
+        stretches(shape.strain, mesh)[0],
         terms_of(measurements, shape, stencils_of(measurements, shape)),
         envelope,
         iterations,

@@ -3,7 +3,7 @@
 Cloth under tension and rubber stretch more along one direction than along the other, and by so much that lengths
 cannot be shared: taken for isometric, a pull looks like a tilt. Two numbers for each view explain it (see
 `factors.edge_length.stretch_kernel`), so few that the shared lengths and the perspective tell them from a tilt. Strains
-that vary over the surface are not told: polynomials of them fit better and reconstruct worse.
+that vary over the surface are left to the noise of the lengths.
 
 Directions on the surface are at first those in the image that the mesh was made in, then those of the surface laid out
 flat.
@@ -25,8 +25,7 @@ from connrsfm_graph.refine.start import log_chords, start_shape
 from connrsfm_graph.refine.task import Fit, Task, minimised
 
 _PROMISING = 1.2
-"""Strains must lower the cost by this factor to be looked into: of what is isometric or stretches otherwise they lower
-it by a tenth or two."""
+"""Strains must lower the cost by this factor to be looked into: a little they always lower it."""
 _ENOUGH, _PLENTY = 1.3, 3.0
 """By the first factor where the ray corrections then look like noise, else by the second."""
 _PULLED = (0.0, 0.5)

@@ -5,21 +5,22 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from connrsfm_graph.refine.mesh import Mesh
 from connrsfm_graph.threads import over_views
 from factors.edge_length import stretch_kernel
 
 
-def stretches(strain: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def stretches(strain: np.ndarray, mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     """Changes (F, E) of log lengths, and their derivatives (F, E, K) by the strains.
 
     Args:
         strain: (F, K) strains of the views, K = 2, or K = 0 where they are not stretched.
-        direction: (E, 2) cosine and sine of twice every edge's angle on the surface.
+        mesh: of the surface, laid out in the plane; from its positions are the directions of the edges.
     """
-    F, K = strain.shape
-    change, derivative = np.zeros((F, len(direction))), np.empty((F, len(direction), K))
+    (F, K), E = strain.shape, len(mesh.edges)
+    change, derivative = np.zeros((F, E)), np.empty((F, E, K))
     if K:
-        over_views(_stretch_kernel, F, strain, direction, change, derivative)
+        over_views(_stretch_kernel, F, strain, mesh.direction, change, derivative)
     return change, derivative
 
 
