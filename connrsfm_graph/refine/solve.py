@@ -19,6 +19,7 @@ from connrsfm_graph.refine.measurements import (
     terms_of,
     total_cost,
 )
+from connrsfm_graph.refine.memory import Memory
 from connrsfm_graph.refine.one_view import fit_views_kernel
 from connrsfm_graph.refine.stretch import stretches
 from connrsfm_graph.threads import over_views
@@ -62,14 +63,14 @@ def minimise(
         damping, inner = _CLOSE_DAMPING, _CLOSE_TOLERANCE
     lagged = lag(measurements, shape)
     history = [total_cost(measurements, shape, lagged)]
-    storage = None
+    storage, memory = None, Memory()
     for _ in range(iterations):
         before = total_cost(measurements, shape, lagged)
         while damping <= largest:
             equations, _ = linearise(measurements, shape, lagged, envelope, storage)
             storage = equations.matrix
             try:
-                factorised = Factorised(equations, envelope, measurements.mesh.edges, damping)
+                factorised = Factorised(equations, envelope, measurements.mesh.edges, damping, memory)
                 trial = moved(shape, envelope, *factorised.step(inner))
                 after = total_cost(measurements, trial, lagged)
                 if closely and before < after < np.inf:
