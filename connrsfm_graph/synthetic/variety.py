@@ -1,7 +1,8 @@
 """A variety of scenes: surfaces of many kinds, cameras at rest or moving, sizes, noise and gaps all drawn at random.
 
-No two seeds are alike, so that a method is seen on what it was not made for. Rolls, waves, cones and planes are paper,
-which keeps its lengths; cloth, tissue and balloons stretch by a few per cent, rubber as a whole by up to a half.
+No two seeds are alike, so that a method is seen on what it was not made for. Rolls, waves, cones, planes, folds and
+torn sheets are paper, which keeps its lengths; cloth, tissue, balloons and faces stretch by a few per cent, rubber as a
+whole by up to a half.
 """
 
 from __future__ import annotations
@@ -73,20 +74,29 @@ def _roll(rng: np.random.Generator) -> Surface:
     return lambda s, t, motion: rolled((s, t), bend * motion[0], axis + turn * motion[1])
 
 
+def _turned(s: Jet, t: Jet, angle: float) -> tuple[Jet, Jet]:
+    """Coordinates along a direction of the sheet and across it."""
+    return s * np.cos(angle) + t * np.sin(angle), t * np.cos(angle) - s * np.sin(angle)
+
+
+def _ruled(along: Jet, across: Jet, axis: float, slope: Callable[[Jet], Jet]) -> Jet:
+    """Paper with a slope angle that depends on the length along one direction of the sheet: isometric."""
+    x = z = 0.0 * along
+    for node, weight in zip(_NODES, _WEIGHTS, strict=True):
+        angle, step = slope(along * (0.5 * (1.0 + node))), along * (0.5 * weight)
+        x, z = x + (angle + np.pi / 2).sin() * step, z + angle.sin() * step
+    return Jet.stack([*_turned(x, across, -axis), z])
+
+
 def _waves(rng: np.random.Generator) -> Surface:
     """Paper with waves across one direction: its slope angle is a sine of the length along the sheet."""
     steep, axis, frequency = rng.uniform(0.2, 0.6), rng.uniform(0.0, np.pi), rng.uniform(1.5, 4.0)
 
     def surface(s: Jet, t: Jet, motion: np.ndarray) -> Jet:
-        along, across = s * np.cos(axis) + t * np.sin(axis), t * np.cos(axis) - s * np.sin(axis)
+        def slope(length: Jet) -> Jet:
+            return (length * frequency + np.pi * motion[1]).sin() * (steep * motion[0])
 
-        def slope(length: Jet, quarter: float) -> Jet:
-            return ((length * frequency + np.pi * motion[1]).sin() * (steep * motion[0]) + quarter).sin()
-
-        parts = [(0.5 * (1.0 + node), 0.5 * weight) for node, weight in zip(_NODES, _WEIGHTS, strict=True)]
-        x = sum((slope(along * part, np.pi / 2) * weight for part, weight in parts), start=0.0 * s) * along
-        z = sum((slope(along * part, 0.0) * weight for part, weight in parts), start=0.0 * s) * along
-        return Jet.stack([x * np.cos(axis) - across * np.sin(axis), x * np.sin(axis) + across * np.cos(axis), z])
+        return _ruled(*_turned(s, t, axis), axis, slope)
 
     return surface
 
@@ -163,6 +173,53 @@ def _rubber(rng: np.random.Generator) -> Surface:
     return surface
 
 
+def _torn(rng: np.random.Generator) -> Surface:
+    """A roll that is cut from its border to about the middle, the flaps on either side bent apart."""
+    bend, axis, most = rng.uniform(0.1, 0.6), rng.uniform(0.0, 2 * np.pi), rng.uniform(0.3, 1.0)
+    tip, beside = rng.uniform(-0.3, 0.2), rng.uniform(-0.2, 0.2)
+
+    def surface(s: Jet, t: Jet, motion: np.ndarray) -> Jet:
+        along, across = _turned(s, t, axis)
+        side = np.sign(across.value - beside) * 0.5 * most * (1.0 + motion[1])
+
+        def slope(length: Jet) -> Jet:
+            flap = length * (length.value > 0.0)
+            return length * (bend * motion[0]) + flap * flap * side
+
+        return _ruled(along - tip, across, axis, slope)
+
+    return surface
+
+
+def _folded(rng: np.random.Generator) -> Surface:
+    """Paper with one crease, which opens and closes; both sides stay plane."""
+    axis, most, crease = rng.uniform(0.0, np.pi), rng.uniform(0.3, 0.8), rng.uniform(-0.3, 0.3)
+
+    def surface(s: Jet, t: Jet, motion: np.ndarray) -> Jet:
+        along, across = _turned(s, t, axis)
+        along = along - crease
+        angle = most * motion[0] * (along.value > 0.0)
+        return Jet.stack([*_turned(along * np.cos(angle), across, -axis), along * np.sin(angle)])
+
+    return surface
+
+
+def _face(rng: np.random.Generator) -> Surface:
+    """A curved relief whose lower part drops and whose sides bulge."""
+    curved, nose = rng.uniform(0.2, 0.5), rng.uniform(0.1, 0.3)
+    drop, bulge, mouth = rng.uniform(0.1, 0.25), rng.uniform(0.05, 0.15), rng.uniform(0.1, 0.3)
+
+    def surface(s: Jet, t: Jet, motion: np.ndarray) -> Jet:
+        lower = ((t - mouth) * 6.0).arctan() / np.pi + 0.5
+        relief = (s * s + t * t * 0.6) * curved - ((s * s + t * t) * 12.0 + 1.0) ** -1.0 * nose
+        for side in (-0.5, 0.5):
+            away = (s - side) * (s - side) + (t - 0.15) * (t - 0.15)
+            relief = relief - (away * 12.0 + 1.0) ** -1.0 * (bulge * motion[0])
+        return Jet.stack([s, t + lower * (0.5 * drop * (1.0 + motion[1])), relief])
+
+    return surface
+
+
 def _rigid(rng: np.random.Generator) -> Surface:
     """A relief that only moves."""
     cloth = _cloth(rng)
@@ -179,5 +236,8 @@ KINDS: dict[str, Callable[[np.random.Generator], Surface]] = {
     "balloon": _balloon,
     "rigid": _rigid,
     "rubber": _rubber,
+    "torn": _torn,
+    "folded": _folded,
+    "face": _face,
 }
 """Kinds of surfaces; one more entry adds one."""

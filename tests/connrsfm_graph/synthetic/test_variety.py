@@ -23,7 +23,7 @@ def metrics(kind: str, seed: int) -> np.ndarray:
     return np.array(forms)
 
 
-@pytest.mark.parametrize("kind", ["roll", "waves", "cone", "plane"])
+@pytest.mark.parametrize("kind", ["roll", "waves", "cone", "plane", "torn", "folded"])
 @pytest.mark.parametrize("seed", range(4))
 def test_paper_keeps_its_lengths(kind: str, seed: int) -> None:
     sheet = np.broadcast_to(np.array([1.0, 0.0, 1.0])[:, None], (3, 50))
@@ -31,7 +31,7 @@ def test_paper_keeps_its_lengths(kind: str, seed: int) -> None:
         np.testing.assert_allclose(form, sheet, atol=1e-7)
 
 
-@pytest.mark.parametrize("kind", ["cloth", "tissue", "balloon"])
+@pytest.mark.parametrize("kind", ["cloth", "tissue", "balloon", "face"])
 def test_what_stretches_does_so_a_little(kind: str) -> None:
     stretch = [np.ptp(metrics(kind, seed), axis=0).max() for seed in range(4)]
     assert min(stretch) > 1e-3
@@ -43,6 +43,23 @@ def test_rubber_is_pulled_as_a_whole() -> None:
         forms = metrics("rubber", seed)
         np.testing.assert_allclose(forms, forms[..., :1].repeat(50, axis=-1), atol=1e-7)
         assert np.ptp(forms[..., 0], axis=0).max() > 0.05
+
+
+def test_the_flaps_of_a_torn_sheet_part() -> None:
+    """Of neighbours only the few across the cut come apart."""
+    openings = []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        surface = KINDS["torn"](rng)
+        s, t = Jet.variables(*(rng.uniform(-1.0, 1.0, (2, 400)) * [[1.0], [0.75]]))
+        closed, opened = (surface(s, t, np.array([0.0, motion])).value for motion in (-1.0, 1.0))
+        before, after = (np.linalg.norm(X[:, :, None] - X[:, None], axis=0) for X in (closed, opened))
+        near = np.triu(before < 0.1, 1)
+        ratio = after[near] / before[near]
+        assert ratio.min() > 0.99
+        assert (ratio > 1.05).mean() < 0.05
+        openings.append(ratio.max())
+    assert np.median(openings) > 2.0
 
 
 def test_what_is_rigid_only_moves() -> None:
