@@ -142,14 +142,14 @@ def _fitted(
     held = fit.shape.views(nearest)
     surface = moved_rigidly(fit.shape.points(fit.measurements.image)[nearest], image, seen)
     start = replace(held, log_depth=np.log(surface[..., 2]), correction=np.zeros_like(image))
-    B, E = len(seen), len(fit.measurements.mesh.edges)
+    E = len(fit.measurements.mesh.edges)
     measurements = Measurements(
         image=image,
         image_weight=fit.noise.image_weight(seen, deviation),
         log_depth=start.log_depth,
         log_length=start.log_length,
         log_length_weight=fit.measurements.log_length_weight,
-        length_weight=np.full((B, E), 1.0 / fit.noise.length),
+        length_weight=fit.measurements.length_weight[nearest],
         factor_weight=fit.measurements.factor_weight[nearest],
         strain_weight=fit.measurements.strain_weight,
         mesh=fit.measurements.mesh,

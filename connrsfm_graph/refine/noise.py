@@ -7,7 +7,7 @@ independent from point to point; a surface that stretches, or a warp's misfit ta
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -26,6 +26,9 @@ _PRIOR = 8.0
 """For the shared log lengths, before the views have shown how well they agree about them."""
 _RELEASE = 10.0
 """After the first fit an interpolated image point is held by so much less than its uncertainty says."""
+_LOOSE = (3.0, 0.01)
+"""Edges count as loose whose lengths differ from view to view by so many times more than the median edge's do, and by
+so much in logarithms."""
 _SETTLED = 0.1
 _GROSS = (5.0, 0.1)
 """A track is wrong beyond so many standard deviations, and this part of an edge's median image length."""
@@ -54,6 +57,9 @@ class Noise:
     `factors.frontal`)."""
     release: float = 1.0
     """Factor on the uncertainty of interpolated image points."""
+    looseness: np.ndarray = field(default_factory=lambda: np.ones(1))
+    """(E,) by what factor the length noise of an edge is larger: one that crosses a tear keeps no length. (1,) before a
+    fit has shown it."""
 
     @staticmethod
     def start(image: float, length: float, spacing: float) -> Noise:
@@ -79,15 +85,24 @@ class Noise:
         """With half the length noise."""
         return replace(self, length=0.5 * self.length)
 
-    def after_fit(self, residual: np.ndarray) -> Noise:
-        """With the robust threshold that length residuals show, and interpolated points released.
+    def after_fit(self, residual: np.ndarray, seen: np.ndarray) -> Noise:
+        """With the robust threshold and the loose edges that length residuals show, and interpolated points released.
 
-        Where residuals are smaller than was assumed, so is all that the lengths' prior may add to the cost.
+        Where residuals are smaller than was assumed, so is all that the lengths' prior may add to the cost. Edges are
+        loosened as by the robust loss of Geman and McClure, all views of one together: what tears is the surface.
+
+        Args:
+            residual: (F, E) length residuals.
+            seen: (F, E) bool, of observed points.
         """
         least, factor, most = _HUBER
         shown = 1.4826 * float(np.median(np.abs(residual))) / self.length
         huber = float(np.clip(factor * shown, least, most))
-        return replace(self, huber=huber, prior=_PRIOR * min(1.0, shown), release=_RELEASE)
+        views, (times, at_least) = seen.sum(axis=0), _LOOSE
+        square = (seen * residual**2).sum(axis=0) / np.maximum(views, 1)
+        usual = float(np.median(square[views > 0])) if views.any() else 0.0
+        looseness = 1.0 + square / max(times**2 * usual, at_least**2)
+        return replace(self, huber=huber, prior=_PRIOR * min(1.0, shown), release=_RELEASE, looseness=looseness)
 
     def settled(self, last: Noise) -> bool:
         """Whether another fit would change little."""
@@ -95,6 +110,7 @@ class Noise:
             self.release == last.release
             and abs(self.image - last.image) <= _SETTLED * last.image
             and abs(self.huber - last.huber) <= _SETTLED * last.huber
+            and float(np.abs(self.looseness**-2.0 - last.looseness**-2.0).max()) <= _SETTLED
         )
 
     def gross(self, size: np.ndarray) -> float:

@@ -13,8 +13,10 @@ from connrsfm_graph.refine.task import Fit, Task, refitted
 
 BEYOND_DOUBT = 0.05
 """A fit that leaves less than this is right, whatever its ray corrections look like."""
-_ROUNDS = 3
+_ROUNDS = 4
 """Fits with noise levels that the one before has shown, at most."""
+_LOOSE = 2.0
+"""Edges of so many times the length noise of others are called loose."""
 _IN_VAIN = 2
 """So often the assumed length noise is halved without points left out being predicted better: what one halving does not
 show the next may."""
@@ -29,8 +31,10 @@ def settled(task: Task, found: Fit) -> Fit:
     long as that leaves the shared lengths where they are: what little noise is left would else crumple all views alike.
     """
     noisy = found.looks_like_noise(task)
+    i, k = task.mesh.edges.T
+    seen = task.seen[:, i] & task.seen[:, k]
     for _ in range(_ROUNDS):
-        noise = found.noise.after_fit(found.residuals())
+        noise = found.noise.after_fit(found.residuals(), seen)
         if not noisy:
             noise = noise.lowered_image(found.shape.correction[task.seen])
         if noise.settled(found.noise):
@@ -72,6 +76,7 @@ def noise_evidence(task: Task, found: Fit) -> dict[str, Any]:
         "image noise": noise.image,
         "image noise over image length of an edge": float(np.sqrt(2.0)) * noise.image / noise.spacing,
         "length noise": noise.length,
+        "loose edges": float((noise.looseness > _LOOSE).mean()),
         "patches assumed frontal": noise.patches,
         "root mean square ray correction": float(np.sqrt((correction[task.seen] ** 2).mean())),
         "correlation of neighbours' ray corrections": neighbour_correlation(correction, task.seen, task.mesh)[0],

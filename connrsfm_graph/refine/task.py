@@ -70,7 +70,7 @@ class Task:
             log_depth=start.log_depth,
             log_length=start.log_length,
             log_length_weight=np.full(len(start.log_length), 0.0 if conformal else noise.prior),
-            length_weight=np.full((len(self.seen), len(self.mesh.edges)), 1.0 / noise.length),
+            length_weight=np.full((len(self.seen), len(self.mesh.edges)), 1.0 / (noise.length * noise.looseness)),
             factor_weight=np.where(self.declared & declared, _DECLARED_FACTOR, _FACTOR),
             strain_weight=1.0 / config.strain_sigma,
             mesh=self.mesh,

@@ -1,0 +1,80 @@
+"""Edges that keep no length: those that cross a tear."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from connrsfm_graph.metrics import evaluate
+from connrsfm_graph.refine import RefineConfig
+from connrsfm_graph.refine.noise import Noise
+from connrsfm_graph.refine.stage import refine
+from connrsfm_graph.synthetic.jet import Jet
+from connrsfm_graph.synthetic.placing import facing_draws, flat_sheet, placed, rolled
+from connrsfm_graph.synthetic.scene import Scene
+
+
+def torn_sheet(seed: int) -> tuple[Scene, np.ndarray]:
+    """A plane sheet cut from one border to its middle whose two flaps roll apart, and (P,) on which flap points are."""
+    rng = np.random.default_rng(seed)
+    s, t = flat_sheet(120, rng)
+    beyond, left = s.value > 0.0, t.value > 0.0
+
+    def draw() -> list[Jet]:
+        surfaces = []
+        for motion in rng.uniform(-1.0, 1.0, (8, 7)):
+            opening = 0.6 * (1.0 + motion[0])
+            up, down = (rolled((s * beyond, t), sign * opening, 0.0).data for sign in (1.0, -1.0))
+            flaps = Jet(np.where(left, up, down))
+            surfaces.append(placed(flaps + Jet.stack([s * ~beyond, 0.0 * s, 0.0 * s]), motion[1:], 25.0, (0.6, 1.0)))
+        return surfaces
+
+    return Scene.of(facing_draws(draw)), np.where(beyond, np.where(left, 1, -1), 0)
+
+
+def error(scene: Scene, points: np.ndarray) -> float:
+    assert scene.tracks.points is not None
+    return evaluate(points, scene.tracks.points, scene.tracks.visible).e3d_percent
+
+
+@pytest.mark.slow
+def test_tears_are_found_and_let_their_sides_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    config, found, shared, errors = RefineConfig(uncertainty=False), [], [], []
+    kept = Noise.after_fit
+    for seed in range(4):
+        scene, flap = torn_sheet(seed)
+        tracks = scene.tracks
+        given = tracks.normalised(), tracks.visible, np.zeros(tracks.visible.shape), config, 1e-4
+        torn = refine(*given)
+        i, k = torn.reference.fit.measurements.mesh.edges.T
+        crosses, loose = flap[i] * flap[k] < 0, torn.reference.fit.noise.looseness > 3.0
+        found.append(loose[crosses].mean())
+        shared.append(loose[~crosses].mean())
+        with monkeypatch.context() as patch:
+            patch.setattr(Noise, "after_fit", lambda self, residual, seen: kept(self, residual, 0 * seen))
+            whole = refine(*given)
+        assert whole.reference.fit.noise.looseness.max() == 1.0
+        errors.append([error(scene, each.points) for each in (torn, whole)])
+    assert np.median(found) > 0.7
+    assert np.median(shared) < 0.1
+    with_tears, without = np.log(errors).mean(axis=0)
+    assert with_tears < without + np.log(0.7)
+
+
+def test_only_edges_far_looser_than_most_are_let_go() -> None:
+    rng = np.random.default_rng(0)
+    residual = rng.normal(0.0, 0.02, (10, 50))
+    seen = rng.random((10, 50)) < 0.7
+    seen[:, 7] = False
+    residual[:, 7] = residual[~seen] = 9.0
+    residual[:, 3] = rng.normal(0.0, 0.3, 10)
+    noise = Noise.start(1e-3, 0.01, 0.1).after_fit(residual, seen)
+    assert noise.looseness[3] > 10.0
+    assert noise.looseness[7] == 1.0
+    assert np.delete(noise.looseness, 3).max() < 1.5
+
+
+def test_in_exact_data_no_edge_is_loose_however_much_it_differs_from_others() -> None:
+    residual = np.full((10, 50), 1e-7)
+    residual[:, 3] = 1e-3
+    assert Noise.start(1e-3, 0.01, 0.1).after_fit(residual, residual > 0.0).looseness.max() < 1.02
