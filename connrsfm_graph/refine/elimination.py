@@ -17,6 +17,7 @@ these sums, one for every residual.
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,7 +25,7 @@ from numba import njit
 
 from connrsfm_graph.errors import ComputationError
 from connrsfm_graph.refine.envelope import Envelope, factor_kernel, solve_kernel, substitute
-from connrsfm_graph.refine.memory import Memory
+from connrsfm_graph.refine.memory import KEPT, Memory
 from connrsfm_graph.threads import over_views
 
 
@@ -195,27 +196,30 @@ class Factorised:
     def solve_border(self, rhs: np.ndarray, tolerance: float, limit: int = 500) -> np.ndarray:
         """S^-1 rhs, shape (S, E + F K), by conjugate gradients preconditioned with the diagonal of D and the memory.
 
-        Each right-hand side on its own, to a relative `tolerance` or `limit` products.
+        Each right-hand side on its own, to `limit` products or a relative `tolerance`: of residuals over the diagonal,
+        whatever the memory.
         """
         v, residual = np.zeros_like(rhs), rhs.copy()
+        left = (residual**2 / self.diagonal).sum(axis=1)
+        goal = tolerance**2 * left
         direction = self.memory.precondition(residual, self.diagonal)
         size = (residual * direction).sum(axis=1)
-        goal = tolerance**2 * size
-        directions: list[np.ndarray] = []
-        products: list[np.ndarray] = []
+        directions: deque[np.ndarray] = deque(maxlen=KEPT)
+        products: deque[np.ndarray] = deque(maxlen=KEPT)
         for _ in range(limit):
-            active = np.flatnonzero(size > goal)
+            active = np.flatnonzero(left > goal)
             if len(active) == 0:
                 break
             along = direction[active]
             product = self.schur_product(along)
             curvature = (along * product).sum(axis=1)
             goal[active[~(curvature > 0.0)]] = np.inf  # rounding is all that is left
-            directions += list(along[curvature > 0.0])
-            products += list(product[curvature > 0.0])
+            directions.extend(along[curvature > 0.0])
+            products.extend(product[curvature > 0.0])
             part = np.divide(size[active], curvature, out=np.zeros_like(curvature), where=curvature > 0.0)[:, None]
             v[active] += part * along
             residual[active] -= part * product
+            left[active] = (residual[active] ** 2 / self.diagonal).sum(axis=1)
             z = self.memory.precondition(residual[active], self.diagonal)
             last, size[active] = size[active], (residual[active] * z).sum(axis=1)
             direction[active] = z + (size[active] / last)[:, None] * along

@@ -26,9 +26,9 @@ _PRIOR = 8.0
 """For the shared log lengths, before the views have shown how well they agree about them."""
 _RELEASE = 10.0
 """After the first fit an interpolated image point is held by so much less than its uncertainty says."""
-_LOOSE = (3.0, 0.01)
+_DIFFERS = (3.0, 0.01)
 """Edges count as loose whose lengths differ from view to view by so many times more than the median edge's do, and by
-so much in logarithms."""
+so much in logarithms. The view in which an edge differs most is left out."""
 _SETTLED = 0.1
 _GROSS = (5.0, 0.1)
 """A track is wrong beyond so many standard deviations, and this part of an edge's median image length."""
@@ -57,7 +57,7 @@ class Noise:
     `factors.frontal`)."""
     release: float = 1.0
     """Factor on the uncertainty of interpolated image points."""
-    looseness: np.ndarray = field(default_factory=lambda: np.ones(1))
+    looseness: np.ndarray = field(default_factory=lambda: np.ones(1), compare=False)
     """(E,) by what factor the length noise of an edge is larger: one that crosses a tear keeps no length. (1,) before a
     fit has shown it."""
 
@@ -98,8 +98,9 @@ class Noise:
         least, factor, most = _HUBER
         shown = 1.4826 * float(np.median(np.abs(residual))) / self.length
         huber = float(np.clip(factor * shown, least, most))
-        views, (times, at_least) = seen.sum(axis=0), _LOOSE
-        square = (seen * residual**2).sum(axis=0) / np.maximum(views, 1)
+        views, (times, at_least) = seen.sum(axis=0), _DIFFERS
+        square = np.where(seen, residual, 0.0) ** 2
+        square = (square.sum(axis=0) - square.max(axis=0)) / np.maximum(views - 1, 1)  # one wrong track is no tear
         usual = float(np.median(square[views > 0])) if views.any() else 0.0
         looseness = 1.0 + square / max(times**2 * usual, at_least**2)
         return replace(self, huber=huber, prior=_PRIOR * min(1.0, shown), release=_RELEASE, looseness=looseness)

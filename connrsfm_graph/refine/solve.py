@@ -28,6 +28,8 @@ _DAMPING = (1e-3, 1e-7, 1e6)
 """First, smallest and largest damping."""
 _CLOSE_DAMPING = 1e-6
 """First one of close steps."""
+_STRANGE = 1.0
+"""From this damping on equations have little in common with those before."""
 _EXACT = 1e-6
 """Mean squared length residual, in assumed variances, below which the data are exact and nothing is left to gain."""
 _INNER_TOLERANCE = 0.2
@@ -51,7 +53,8 @@ def minimise(
         shape: start, which close steps ask to be near a minimum: from afar they lead to others.
         iterations: at most so many.
         tolerance: stop where an iteration lowers the cost by less than this part.
-        closely: whether steps are solved closely, hardly damped at first, and bent where straight ones are refused.
+        closely: whether steps are solved closely and each on its own, hardly damped at first, and bent where straight
+            ones are refused.
 
     Returns:
         The shape and the cost at the start and after every iteration.
@@ -70,7 +73,8 @@ def minimise(
             equations, _ = linearise(measurements, shape, lagged, envelope, storage)
             storage = equations.matrix
             try:
-                factorised = Factorised(equations, envelope, measurements.mesh.edges, damping, memory)
+                known = None if closely or damping >= _STRANGE else memory
+                factorised = Factorised(equations, envelope, measurements.mesh.edges, damping, known)
                 trial = moved(shape, envelope, *factorised.step(inner))
                 after = total_cost(measurements, trial, lagged)
                 if closely and before < after < np.inf:

@@ -1,8 +1,8 @@
 """A variety of scenes: surfaces of many kinds, cameras at rest or moving, sizes, noise and gaps all drawn at random.
 
 No two seeds are alike, so that a method is seen on what it was not made for. Rolls, waves, cones, planes, folds and
-torn sheets are paper, which keeps its lengths; cloth, tissue, balloons and faces stretch by a few per cent, rubber as a
-whole by up to a half.
+torn sheets are paper, which keeps its lengths; cloth, tissue and balloons stretch by a few per cent, faces by up to a
+third about the mouth, rubber as a whole by up to a half.
 """
 
 from __future__ import annotations

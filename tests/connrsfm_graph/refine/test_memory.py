@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from connrsfm_graph.refine.memory import _KEPT, Memory
+from connrsfm_graph.refine.memory import KEPT, Memory
 
 
 def matrix(n: int, seed: int, spread: float) -> np.ndarray:
@@ -49,10 +49,14 @@ def test_conjugate_directions_invert_what_they_span(n: int, seed: int) -> None:
 
 
 def test_the_last_directions_are_kept() -> None:
-    n = 2 * _KEPT
+    n = 2 * KEPT
     A, directions = matrix(n, 0, 5.0), np.eye(n)
-    both, last = remembered(A, directions), remembered(A, directions[-_KEPT:])
+    both, last = remembered(A, directions), remembered(A, directions[-KEPT:])
     residual = np.random.default_rng(1).normal(size=(1, n))
     both.keep([], [])
+    parts = Memory()
+    for part in (directions[: n - 5], directions[n - 5 :]):
+        parts.keep(list(part), list(part @ A))
     np.testing.assert_array_equal(both.precondition(residual, np.diag(A)), last.precondition(residual, np.diag(A)))
+    np.testing.assert_array_equal(parts.precondition(residual, np.diag(A)), last.precondition(residual, np.diag(A)))
     assert both.precondition(residual, np.diag(A)) != pytest.approx(residual / np.diag(A))
