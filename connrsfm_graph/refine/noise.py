@@ -101,7 +101,7 @@ class Noise:
         views, (times, at_least) = seen.sum(axis=0), _DIFFERS
         square = np.where(seen, residual, 0.0) ** 2
         square = (square.sum(axis=0) - square.max(axis=0)) / np.maximum(views - 1, 1)  # one wrong track is no tear
-        usual = float(np.median(square[views > 0])) if views.any() else 0.0
+        usual = float(np.median(square[views > 1])) if (views > 1).any() else 0.0
         looseness = 1.0 + square / max(times**2 * usual, at_least**2)
         return replace(self, huber=huber, prior=_PRIOR * min(1.0, shown), release=_RELEASE, looseness=looseness)
 

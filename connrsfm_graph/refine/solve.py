@@ -19,7 +19,6 @@ from connrsfm_graph.refine.measurements import (
     terms_of,
     total_cost,
 )
-from connrsfm_graph.refine.memory import Memory
 from connrsfm_graph.refine.one_view import fit_views_kernel
 from connrsfm_graph.refine.stretch import stretches
 from connrsfm_graph.threads import over_views
@@ -28,8 +27,6 @@ _DAMPING = (1e-3, 1e-7, 1e6)
 """First, smallest and largest damping."""
 _CLOSE_DAMPING = 1e-6
 """First one of close steps."""
-_STRANGE = 1.0
-"""From this damping on equations have little in common with those before."""
 _EXACT = 1e-6
 """Mean squared length residual, in assumed variances, below which the data are exact and nothing is left to gain."""
 _INNER_TOLERANCE = 0.2
@@ -53,8 +50,7 @@ def minimise(
         shape: start, which close steps ask to be near a minimum: from afar they lead to others.
         iterations: at most so many.
         tolerance: stop where an iteration lowers the cost by less than this part.
-        closely: whether steps are solved closely and each on its own, hardly damped at first, and bent where straight
-            ones are refused.
+        closely: whether steps are solved closely, hardly damped at first, and bent where straight ones are refused.
 
     Returns:
         The shape and the cost at the start and after every iteration.
@@ -66,15 +62,14 @@ def minimise(
         damping, inner = _CLOSE_DAMPING, _CLOSE_TOLERANCE
     lagged = lag(measurements, shape)
     history = [total_cost(measurements, shape, lagged)]
-    storage, memory = None, Memory()
+    storage = None
     for _ in range(iterations):
         before = total_cost(measurements, shape, lagged)
         while damping <= largest:
             equations, _ = linearise(measurements, shape, lagged, envelope, storage)
             storage = equations.matrix
             try:
-                known = None if closely or damping >= _STRANGE else memory
-                factorised = Factorised(equations, envelope, measurements.mesh.edges, damping, known)
+                factorised = Factorised(equations, envelope, measurements.mesh.edges, damping)
                 trial = moved(shape, envelope, *factorised.step(inner))
                 after = total_cost(measurements, trial, lagged)
                 if closely and before < after < np.inf:
