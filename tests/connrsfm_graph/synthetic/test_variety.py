@@ -31,11 +31,11 @@ def test_paper_keeps_its_lengths(kind: str, seed: int) -> None:
         np.testing.assert_allclose(form, sheet, atol=1e-7)
 
 
-@pytest.mark.parametrize(("kind", "most"), [("cloth", 0.8), ("tissue", 0.8), ("balloon", 0.8), ("face", 1.0)])
-def test_what_stretches_does_so_a_little(kind: str, most: float) -> None:
+@pytest.mark.parametrize("kind", ["cloth", "tissue", "balloon", "face"])
+def test_what_stretches_does_so_a_little(kind: str) -> None:
     stretch = [np.ptp(metrics(kind, seed), axis=0).max() for seed in range(4)]
     assert min(stretch) > 1e-3
-    assert max(stretch) < most
+    assert max(stretch) < 0.8
 
 
 def test_rubber_is_pulled_as_a_whole() -> None:
