@@ -8,7 +8,8 @@
 Each view's H_f is factored by Cholesky inside its envelope: row r is stored from its first non-zero column on, and
 points are ordered by a sweep across the surface, so rows are short. The cost is linear in views. The Schur complement
 S = D - sum_f W_f' H_f^-1 W_f on the border is dense, so it is never formed: conjugate gradients apply it by one
-forward and backward substitution per view. Several right-hand sides at once read each view's factor once for all.
+forward and backward substitution per view. Several right-hand sides at once read each view's factor once for all. What
+one solution has found out about S helps the next (see `memory`).
 
 A length residual falls by the sum of its shared length and its view's strain times a derivative; all of S acts through
 these sums, one for every residual.
@@ -16,6 +17,7 @@ these sums, one for every residual.
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +25,7 @@ from numba import njit
 
 from connrsfm_graph.errors import ComputationError
 from connrsfm_graph.refine.envelope import Envelope, factor_kernel, solve_kernel, substitute
+from connrsfm_graph.refine.memory import KEPT, Memory
 from connrsfm_graph.threads import over_views
 
 
@@ -111,7 +114,14 @@ def _schur_terms(begin, end, factor, first, start, border, weight, ends, v, out)
 class Factorised:
     """Damped normal equations with the views' matrices factored; solves and products with inverses."""
 
-    def __init__(self, equations: NormalEquations, envelope: Envelope, edges: np.ndarray, damping: float = 0.0):
+    def __init__(
+        self,
+        equations: NormalEquations,
+        envelope: Envelope,
+        edges: np.ndarray,
+        damping: float = 0.0,
+        memory: Memory | None = None,
+    ):
         """Factor.
 
         Args:
@@ -119,6 +129,7 @@ class Factorised:
             envelope: storage of the views' matrices.
             edges: (E, 2) points of each length.
             damping: Marquardt's: diagonals are multiplied by 1 + damping.
+            memory: of former equations that were much the same; solutions add to it.
 
         Raises:
             ComputationError: a view's matrix is not positive definite.
@@ -126,6 +137,7 @@ class Factorised:
         self.equations = equations
         self.envelope = envelope
         self.ends = envelope.unknown[edges]
+        self.memory = Memory() if memory is None else memory
         of_strains = np.einsum("fe,fek->fk", equations.weight, equations.by_strain**2) + equations.strain_weight
         of_lengths = equations.weight.sum(axis=0) + equations.length_weight
         self.diagonal = np.concatenate([of_lengths, of_strains.ravel()]) * (1.0 + damping)
@@ -182,27 +194,36 @@ class Factorised:
         return product
 
     def solve_border(self, rhs: np.ndarray, tolerance: float, limit: int = 500) -> np.ndarray:
-        """S^-1 rhs, shape (S, E + F K), by conjugate gradients preconditioned with the diagonal of D.
+        """S^-1 rhs, shape (S, E + F K), by conjugate gradients preconditioned with the diagonal of D and the memory.
 
-        Each right-hand side on its own, to a relative `tolerance` or `limit` products.
+        Each right-hand side on its own, to `limit` products or a relative `tolerance`: of residuals over the diagonal,
+        whatever the memory.
         """
         v, residual = np.zeros_like(rhs), rhs.copy()
-        direction = residual / self.diagonal
+        left = (residual**2 / self.diagonal).sum(axis=1)
+        goal = tolerance**2 * left
+        direction = self.memory.precondition(residual, self.diagonal)
         size = (residual * direction).sum(axis=1)
-        goal = tolerance**2 * size
+        directions: deque[np.ndarray] = deque(maxlen=KEPT)
+        products: deque[np.ndarray] = deque(maxlen=KEPT)
         for _ in range(limit):
-            active = np.flatnonzero(size > goal)
+            active = np.flatnonzero(left > goal)
             if len(active) == 0:
                 break
-            product = self.schur_product(direction[active])
-            curvature = (direction[active] * product).sum(axis=1)
+            along = direction[active]
+            product = self.schur_product(along)
+            curvature = (along * product).sum(axis=1)
             goal[active[~(curvature > 0.0)]] = np.inf  # rounding is all that is left
+            directions.extend(along[curvature > 0.0])
+            products.extend(product[curvature > 0.0])
             part = np.divide(size[active], curvature, out=np.zeros_like(curvature), where=curvature > 0.0)[:, None]
-            v[active] += part * direction[active]
+            v[active] += part * along
             residual[active] -= part * product
-            z = residual[active] / self.diagonal
+            left[active] = (residual[active] ** 2 / self.diagonal).sum(axis=1)
+            z = self.memory.precondition(residual[active], self.diagonal)
             last, size[active] = size[active], (residual[active] * z).sum(axis=1)
-            direction[active] = z + (size[active] / last)[:, None] * direction[active]
+            direction[active] = z + (size[active] / last)[:, None] * along
+        self.memory.keep(directions, products)
         return v
 
     def step(self, tolerance: float) -> tuple[np.ndarray, np.ndarray]:

@@ -19,45 +19,55 @@ _PARTS, _USED, _ENOUGH = 5, 3, 1000
 enough observations."""
 _LEFT_OUT = 1e-2
 """Factor on the weight of an image point that is left out: enough to keep it where nothing else holds it."""
-_ITERATIONS = 8
-"""Of every fit, the same number for all that are compared. They are close ones: a fit that has not yet forgotten a
-point predicts it too well, and the better the tighter its lengths are held."""
-_SIGNIFICANT = 2.0
-"""Standard errors by which the errors' mean must differ."""
+_FIRST, _NEXT, _TOLERANCE = 24, 6, 1e-4
+"""Iterations at most of each part's first fit and of those that follow, and their tolerance. They are close ones: a fit
+that has not yet forgotten a point predicts it too well, and the better the tighter its lengths are held."""
 _GROSS = 9.0
 """Squared errors count up to this many times their median: wrong tracks predict nothing."""
 
 
-def prediction_errors(measurements: Measurements, shape: Shape, seen: np.ndarray) -> np.ndarray:
-    """(N,) squared distances of image points from where the fit to the others puts them.
+class HeldOut:
+    """Fits that are each without a part of the observations, and what they predict of it.
 
-    Args:
-        measurements: what was fitted.
-        shape: the fit to all points.
-        seen: (F, P) bool; points are the same for the same array.
+    Fits under other weights go on from the last ones, which have forgotten the points that are left out.
     """
-    part = np.where(seen, np.random.default_rng(0).integers(_PARTS, size=seen.shape), _PARTS)
-    errors = []
-    for number in range(_USED):
-        left_out = part == number
-        weight = np.where(left_out, _LEFT_OUT, 1.0) * measurements.image_weight
-        fitted, _ = minimise(replace(measurements, image_weight=weight), shape, _ITERATIONS, 0.0, closely=True)
-        errors.append((fitted.correction[left_out] ** 2).sum(axis=-1))
-        if sum(map(len, errors)) >= _ENOUGH:
-            break
-    return np.concatenate(errors)
+
+    def __init__(self, shape: Shape, seen: np.ndarray):
+        """Deal the observations out.
+
+        Args:
+            shape: a fit to all points, near those that will be.
+            seen: (F, P) bool; points are the same for the same array.
+        """
+        self._part = np.where(seen, np.random.default_rng(0).integers(_PARTS, size=seen.shape), _PARTS)
+        size = np.cumsum([np.count_nonzero(self._part == number) for number in range(_USED)])
+        self._fits = [shape] * min(_USED, 1 + int(np.searchsorted(size, _ENOUGH)))
+        self._iterations = _FIRST
+
+    def errors(self, measurements: Measurements) -> np.ndarray:
+        """(N,) squared distances of image points from where the fit to the others puts them."""
+        errors = []
+        for number, last in enumerate(self._fits):
+            left_out = self._part == number
+            weight = np.where(left_out, _LEFT_OUT, 1.0) * measurements.image_weight
+            others = replace(measurements, image_weight=weight)
+            fit, _ = minimise(others, last, self._iterations, _TOLERANCE, closely=True)
+            errors.append((fit.correction[left_out] ** 2).sum(axis=-1))
+            self._fits[number] = fit
+        self._iterations = _NEXT
+        return np.concatenate(errors)
 
 
 def gain(errors: np.ndarray, than: np.ndarray) -> tuple[float, float]:
     """Mean by which squared errors (N,) are smaller than others at the same points, and its standard error."""
-    if len(errors) < 2:
+    if len(errors) == 0:
         return 0.0, 0.0
     most = _GROSS * float(np.median(than))
     difference = np.minimum(than, most) - np.minimum(errors, most)
     return float(difference.mean()), float(difference.std()) / float(np.sqrt(len(difference)))
 
 
-def predicts_better(errors: np.ndarray, than: np.ndarray) -> bool:
-    """Whether squared errors (N,) of one fit are significantly smaller than those of another at the same points."""
-    mean, deviation = gain(errors, than)
-    return mean > _SIGNIFICANT * deviation
+def within_one_deviation(errors: np.ndarray, best: np.ndarray) -> bool:
+    """Whether squared errors (N,) are larger than the best by at most the standard error of the difference."""
+    better_by, deviation = gain(errors, best)
+    return better_by >= -deviation

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from connrsfm_graph.refine.held_out import prediction_errors, predicts_better
-from connrsfm_graph.refine.noise import neighbour_correlation
+from connrsfm_graph.refine.held_out import HeldOut, gain, within_one_deviation
+from connrsfm_graph.refine.noise import Noise, neighbour_correlation
 from connrsfm_graph.refine.task import Fit, Task, refitted
 
 BEYOND_DOUBT = 0.05
@@ -18,8 +18,8 @@ _ROUNDS = 4
 _LOOSE = 2.0
 """Edges of so many times the length noise of others are called loose."""
 _IN_VAIN = 2
-"""So often the assumed length noise is halved without points left out being predicted better: what one halving does not
-show the next may."""
+"""So often the assumed length noise is halved although points left out are predicted worse: the next halving may tell
+another thing."""
 _LEAST = 0.005
 """Below this part of what it was assumed to be at first it is not halved again."""
 
@@ -50,22 +50,35 @@ def settled(task: Task, found: Fit) -> Fit:
 
 
 def trusting_lengths(task: Task, found: Fit) -> Fit:
-    """A settled fit with half the length noise, again and again while points left out are predicted better.
+    """A settled fit with half the length noise, again and again, as far as points left out have nothing against it.
 
-    That tells what keeps its lengths, as paper does, from what stretches a little. Only noise of the image points asks
-    for it, and slants are settled before: while lengths are held tightly they hardly move. What is pulled as a whole is
-    never pulled quite evenly; tighter lengths would predict what is near, and tilt the rest.
+    That tells what keeps its lengths, as paper does, from what stretches a little. Taken is the least length noise with
+    which they are predicted within one standard error as well as with the best, the usual rule of cross-validation
+    (Breiman et al., Classification and regression trees, 1984): where they do not tell, surfaces are isometric.
+
+    Only noise of the image points asks for it, and slants are settled before: while lengths are held tightly they
+    hardly move. What is pulled as a whole is never pulled quite evenly; tighter lengths would predict what is near, and
+    tilt the rest.
     """
     if not found.noisy or found.misfit() < BEYOND_DOUBT or found.shape.strain.size:
         return found
-    errors = prediction_errors(found.measurements, found.shape, task.seen)
-    trial, in_vain = found, 0
-    while in_vain < _IN_VAIN and trial.noise.length > _LEAST * task.config.length_sigma:
-        trial = refitted(task, trial, trial.noise.halved_length())
-        new = prediction_errors(trial.measurements, trial.shape, task.seen)
-        in_vain += 1
-        if predicts_better(new, errors):
-            found, errors, in_vain = trial, new, 0
+    left_out, noise = HeldOut(found.shape, task.seen), found.noise
+
+    def errors_under(noise: Noise) -> np.ndarray:
+        return left_out.errors(task.measurements(noise, conformal=found.conformal))
+
+    half = noise.halved_length()
+    for level in (noise, half, half.halved_length(), half):
+        errors_under(level)  # fits have something left of the points left out until they have been elsewhere
+    errors, best = [errors_under(noise)], 0
+    while len(errors) - 1 - best < _IN_VAIN and noise.length > _LEAST * task.config.length_sigma:
+        noise = noise.halved_length()
+        errors.append(errors_under(noise))
+        if gain(errors[-1], errors[best])[0] > 0.0:
+            best = len(errors) - 1
+    halvings = max(level for level, of_level in enumerate(errors) if within_one_deviation(of_level, errors[best]))
+    for _ in range(halvings):
+        found = refitted(task, found, found.noise.halved_length())
     return found
 
 

@@ -11,20 +11,27 @@ from dataclasses import replace
 
 import numpy as np
 
-from connrsfm_graph.refine.held_out import gain, prediction_errors
+from connrsfm_graph.refine.held_out import HeldOut, gain
+from connrsfm_graph.refine.noise import Noise
 from connrsfm_graph.refine.settle import BEYOND_DOUBT
+from connrsfm_graph.refine.start import start_shape
 from connrsfm_graph.refine.task import Fit, Task, refitted
 
 _COMPARED, _TAKEN = (12, 3e-4), (60, 1e-4)
 """Iterations at most and tolerance of the fits that are compared, and of the one that is taken: slants move last."""
 _FLATTENED = 0.25
 """Part of their relief that surfaces keep in a second start: what is far too steep comes down slowly by itself."""
+_INCLINATION, _DIRECTIONS = 30.0, 6
+"""Degrees and number of directions of the inclined planes from which all views start as well."""
+_PROMISING = (6, 2)
+"""So many iterations tell which of them are; so many are gone on with."""
 
 
 def seen_frontally(task: Task, found: Fit) -> Fit:
     """An isometric fit, its surfaces taken to be seen frontally as far as points left out say.
 
-    Taken is the prior with which points left out are predicted best, where that is better than without any.
+    Taken is the prior with which points left out are predicted best, where that is better than without any. Where a
+    fit under the prior leads to a cheaper one without it, that one is gone on with.
     """
     if found.misfit() < BEYOND_DOUBT or not task.config.frontal_patches:
         return found
@@ -32,18 +39,41 @@ def seen_frontally(task: Task, found: Fit) -> Fit:
         replace(task, config=replace(task.config, iterations=iterations, tolerance=tolerance))
         for iterations, tolerance in (_COMPARED, _TAKEN)
     )
-    without = refitted(compared, found, found.noise)
-    errors = prediction_errors(without.measurements, without.shape, task.seen)
-    best, most = found, 0.0
-    starts = [found, _flattened(found)]
-    for patches in task.config.frontal_patches:
-        noise = replace(found.noise, patches=patches)
-        trial = min((refitted(compared, start, noise) for start in starts), key=lambda fit: fit.history[-1])
-        better_by, _ = gain(prediction_errors(trial.measurements, trial.shape, task.seen), errors)
+    priors = [replace(found.noise, patches=patches) for patches in task.config.frontal_patches]
+    starts = [found, _flattened(found), *_inclined(task, found, priors[0])]
+    first = _cheapest(compared, starts, priors[0])
+    without, other = (refitted(compared, start, found.noise) for start in (found, first))
+    if other.history[-1] < without.history[-1]:
+        found = without = other
+    errors = HeldOut(without.shape, task.seen).errors(without.measurements)
+    best, most, trial = found, 0.0, first
+    for noise in priors:
+        trial = trial if trial.noise is noise else _cheapest(compared, [trial], noise)
+        better_by, _ = gain(HeldOut(trial.shape, task.seen).errors(trial.measurements), errors)
         if better_by > most:
             best, most = trial, better_by
-        starts = [trial]
     return found if best is found else refitted(taken, best, best.noise)
+
+
+def _cheapest(task: Task, starts: list[Fit], noise: Noise) -> Fit:
+    """The fit from several starts that costs least."""
+    return min((refitted(task, start, noise) for start in starts), key=lambda fit: fit.history[-1])
+
+
+def _inclined(task: Task, found: Fit, noise: Noise) -> list[Fit]:
+    """What becomes of planes that are inclined alike in all views: the cheapest of several directions.
+
+    Before a camera at rest all views may be caught in the same wrong slant, and none can tell the others.
+    """
+    iterations, kept = _PROMISING
+    quick = replace(task, config=replace(task.config, iterations=iterations))
+    fits = []
+    for angle in 2.0 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS:
+        slope = np.tan(np.radians(_INCLINATION)) * np.array([np.cos(angle), np.sin(angle)])
+        plane = start_shape(task.inclined(slope).completed, task.mesh)
+        plane = replace(plane, strain=np.zeros_like(found.shape.strain))
+        fits.append(refitted(quick, replace(found, shape=plane), noise))
+    return sorted(fits, key=lambda fit: fit.history[-1])[:kept]
 
 
 def _flattened(found: Fit) -> Fit:

@@ -19,6 +19,7 @@ from connrsfm_graph.refine.measurements import (
     terms_of,
     total_cost,
 )
+from connrsfm_graph.refine.memory import Memory
 from connrsfm_graph.refine.one_view import fit_views_kernel
 from connrsfm_graph.refine.stretch import stretches
 from connrsfm_graph.threads import over_views
@@ -27,11 +28,13 @@ _DAMPING = (1e-3, 1e-7, 1e6)
 """First, smallest and largest damping."""
 _CLOSE_DAMPING = 1e-6
 """First one of close steps."""
+_STRANGE = 1.0
+"""From this damping on equations have little in common with those before."""
 _EXACT = 1e-6
 """Mean squared length residual, in assumed variances, below which the data are exact and nothing is left to gain."""
 _INNER_TOLERANCE = 0.2
 """Relative accuracy of the conjugate gradients: what they leave the next iteration corrects, as it does curvature."""
-_CLOSE_TOLERANCE = 0.1
+_CLOSE_TOLERANCE = 0.05
 """That of close steps."""
 _COINCIDENT = 1e-300
 """Squared chords are at least so long, as in the factors."""
@@ -62,14 +65,15 @@ def minimise(
         damping, inner = _CLOSE_DAMPING, _CLOSE_TOLERANCE
     lagged = lag(measurements, shape)
     history = [total_cost(measurements, shape, lagged)]
-    storage = None
+    storage, memory = None, Memory()
     for _ in range(iterations):
         before = total_cost(measurements, shape, lagged)
         while damping <= largest:
             equations, _ = linearise(measurements, shape, lagged, envelope, storage)
             storage = equations.matrix
             try:
-                factorised = Factorised(equations, envelope, measurements.mesh.edges, damping)
+                known = None if damping >= _STRANGE else memory
+                factorised = Factorised(equations, envelope, measurements.mesh.edges, damping, known)
                 trial = moved(shape, envelope, *factorised.step(inner))
                 after = total_cost(measurements, trial, lagged)
                 if closely and before < after < np.inf:

@@ -55,6 +55,12 @@ class Task:
         """The same from flat views in front of the camera."""
         return replace(self, completed=replace(self.completed, log_depth=np.zeros_like(self.completed.log_depth)))
 
+    def inclined(self, slope: np.ndarray) -> Task:
+        """The same from views that are planes of a slope (2,), depth over image coordinates at depth one."""
+        image = self.completed.image
+        nearness = 1.0 - (image - image.mean(axis=1, keepdims=True)) @ slope
+        return replace(self, completed=replace(self.completed, log_depth=-np.log(np.maximum(nearness, 0.1))))
+
     def spacing(self) -> float:
         """Median image length of the near edges."""
         near = self.mesh.edges[: self.mesh.n_near]

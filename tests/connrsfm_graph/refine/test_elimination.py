@@ -13,6 +13,7 @@ from connrsfm_graph.refine import solve
 from connrsfm_graph.refine.cost import Weights
 from connrsfm_graph.refine.elimination import Factorised
 from connrsfm_graph.refine.measurements import Measurements, Shape, costs, lag, linearise, moved, total_cost
+from connrsfm_graph.refine.memory import Memory
 from connrsfm_graph.refine.mesh import surface_mesh
 from connrsfm_graph.refine.solve import fit_views
 from factors.adapter import make_factor
@@ -211,3 +212,19 @@ def test_a_matrix_that_is_not_positive_definite_is_named():
     equations.matrix[1] *= -1.0
     with pytest.raises(ComputationError, match="normal equations of a view are not positive definite"):
         Factorised(equations, envelope, measurements.mesh.edges)
+
+
+def test_solutions_are_the_same_with_a_memory_and_take_fewer_products(monkeypatch):
+    measurements, shape = _random_problem(conformal=False, bending=False, seed=3, frontal=0.0)
+    envelope, edges = measurements.envelope(False), measurements.mesh.edges
+    products = []
+    product = Factorised.schur_product
+    monkeypatch.setattr(Factorised, "schur_product", lambda self, v: products.append(len(v)) or product(self, v))
+    lengths, counts = [], []
+    for memory in (Memory(), remembering := Memory(), remembering):
+        equations, _ = linearise(measurements, shape, lag(measurements, shape), envelope)
+        products.clear()
+        lengths.append(Factorised(equations, envelope, edges, damping=1e-3, memory=memory).step(1e-10)[1])
+        counts.append(len(products))
+    assert counts[2] < 0.5 * counts[0] == 0.5 * counts[1]
+    assert lengths[2] == pytest.approx(lengths[0], abs=1e-7 * np.abs(lengths[0]).max())

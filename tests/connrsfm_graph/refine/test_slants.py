@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from connrsfm_graph.metrics import evaluate
 from connrsfm_graph.refine import RefineConfig, Refined, refine, slant
+from connrsfm_graph.refine.held_out import HeldOut
 from connrsfm_graph.refine.measurements import Measurements
 from connrsfm_graph.refine.noise import Noise
 from connrsfm_graph.refine.start import start_shape
@@ -54,11 +58,12 @@ def test_the_prior_that_predicts_points_left_out_best_is_taken(
 ) -> None:
     errors = np.random.default_rng(0).chisquare(2, 500)
 
-    def canned(measurements: Measurements, *arguments: object) -> np.ndarray:
-        patches = round(measurements.weights.frontal * len(measurements.mesh.edges) / 8.0)
-        return np.asarray((1.0 - {0: 0.0, **gains}[patches]) * errors)
+    class Canned(HeldOut):
+        def errors(self, measurements: Measurements) -> np.ndarray:
+            patches = round(measurements.weights.frontal * len(measurements.mesh.edges) / 8.0)
+            return np.asarray((1.0 - {0: 0.0, **gains}[patches]) * errors)
 
-    monkeypatch.setattr("connrsfm_graph.refine.slant.prediction_errors", canned)
+    monkeypatch.setattr("connrsfm_graph.refine.slant.HeldOut", Canned)
     assert refined(at_rest(5, 30, 0), SIGMA).evidence["patches assumed frontal"] == taken
 
 
@@ -75,8 +80,40 @@ def test_flattened_surfaces_have_less_relief_and_lengths_to_match() -> None:
     assert np.median(flat.residuals(), axis=0) == pytest.approx(np.zeros(len(task.mesh.edges)), abs=1e-12)
 
 
+def test_inclined_views_are_planes() -> None:
+    points = at_rest(5, 30, 0)
+    image, seen = points[..., :2] / points[..., 2:], np.ones(points.shape[:2], dtype=bool)
+    task = Task.of(complete(image, seen, np.log(points[..., 2])), seen, RefineConfig())
+    slope = np.array([0.5, -0.2])
+    depth = np.exp(task.inclined(slope).completed.log_depth)
+    for view, d in zip(image, depth, strict=True):
+        plane = np.linalg.lstsq(np.column_stack([d[:, None] * view, d]), np.ones(len(d)), rcond=None)[0]
+        np.testing.assert_allclose(d * (view @ plane[:2] + plane[2]), 1.0, atol=1e-12)
+        np.testing.assert_allclose(plane[:2] / (plane[2] + view.mean(axis=0) @ plane[:2]), -slope, atol=1e-12)
+
+
+def test_planes_that_lean_the_right_way_become_the_cheapest_surfaces() -> None:
+    """And keep the strains of views that are stretched."""
+    points = isometric_bending(8, 80, bend=0.8, at_rest=True, seed=1).tracks.points
+    assert points is not None
+    middle = points.mean(axis=(0, 1))
+    turn = Rotation.from_euler("x", 40, degrees=True).as_matrix()
+    points = (points - middle) @ turn.T + middle
+    image, seen = points[..., :2] / points[..., 2:], np.ones(points.shape[:2], dtype=bool)
+    task = Task.of(complete(image, seen, np.zeros_like(points[..., 2])), seen, RefineConfig())
+    noise = Noise.start(SIGMA, 0.01, task.spacing())
+    flat = start_shape(task.completed, task.mesh)
+    found = Fit(task.measurements(noise, conformal=False), flat, noise, [], 0.0)
+    fits = slant._inclined(task, found, noise)
+    assert fits[0].history[-1] <= fits[1].history[-1]
+    errors = [evaluate(shape.points(image), points).e3d_percent for shape in (fits[0].shape, flat)]
+    assert errors[0] < 0.5 * errors[1]
+    stretched = replace(found, shape=replace(flat, strain=np.zeros((8, 2))))
+    assert slant._inclined(task, stretched, noise)[0].shape.strain.shape == (8, 2)
+
+
 def test_exact_data_and_no_patches_leave_nothing_to_assume(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("connrsfm_graph.refine.slant.prediction_errors", never)
+    monkeypatch.setattr("connrsfm_graph.refine.slant.HeldOut", never)
     points = at_rest(5, 30, 0)
     assert refined(points, 1e-7).evidence["patches assumed frontal"] == 0
     assert refined(points, SIGMA, ()).evidence["patches assumed frontal"] == 0
@@ -85,7 +122,7 @@ def test_exact_data_and_no_patches_leave_nothing_to_assume(monkeypatch: pytest.M
 
 
 def test_what_is_taken_for_conformal_has_no_slants_compared(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("connrsfm_graph.refine.slant.prediction_errors", never)
+    monkeypatch.setattr("connrsfm_graph.refine.slant.HeldOut", never)
     points = moebius(5, 60).tracks.points
     assert points is not None
     found = refined(points, 1e-6)
