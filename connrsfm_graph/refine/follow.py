@@ -110,7 +110,7 @@ def follow(
         measurements, shape = measurements.replaced(again, part[0]), shape.replaced(again, part[1])
     deviation = np.full(visible.shape, np.nan)
     if config.uncertainty:
-        deviation = log_depth_deviation(measurements, shape, stretch=not fit.noisy, jointly=False)
+        deviation = log_depth_deviation(fit.doubted(measurements), shape, stretch=not fit.noisy, jointly=False)
     group = np.zeros(len(visible), dtype=int) if fit.ambiguity is None else fit.ambiguity.group[nearest]
     alternative = None
     if fit.alternative is not None:

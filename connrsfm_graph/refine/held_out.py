@@ -67,7 +67,7 @@ def gain(errors: np.ndarray, than: np.ndarray) -> tuple[float, float]:
     return float(difference.mean()), float(difference.std()) / float(np.sqrt(len(difference)))
 
 
-def within_one_deviation(errors: np.ndarray, best: np.ndarray) -> bool:
-    """Whether squared errors (N,) are larger than the best by at most the standard error of the difference."""
+def within(deviations: float, errors: np.ndarray, best: np.ndarray) -> bool:
+    """Whether squared errors (N,) are larger than the best by at most so many standard errors of the difference."""
     better_by, deviation = gain(errors, best)
-    return better_by >= -deviation
+    return better_by >= -deviations * deviation

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from connrsfm_graph.refine.held_out import HeldOut, gain, within_one_deviation
+from connrsfm_graph.refine.held_out import HeldOut, gain, within
 from connrsfm_graph.refine.noise import Noise, neighbour_correlation
 from connrsfm_graph.refine.task import Fit, Task, refitted
 
@@ -20,6 +20,9 @@ _LOOSE = 2.0
 _IN_VAIN = 2
 """So often the assumed length noise is halved although points left out are predicted worse: the next halving may tell
 another thing."""
+_TAKEN, _REFUTED = 1.0, 2.0
+"""By so many standard errors points left out are predicted worse than with the best length noise, at most with the one
+that is taken, and at least with one that is refuted."""
 _LEAST = 0.005
 """Below this part of what it was assumed to be at first it is not halved again."""
 
@@ -54,7 +57,8 @@ def trusting_lengths(task: Task, found: Fit) -> Fit:
 
     That tells what keeps its lengths, as paper does, from what stretches a little. Taken is the least length noise with
     which they are predicted within one standard error as well as with the best, the usual rule of cross-validation
-    (Breiman et al., Classification and regression trees, 1984): where they do not tell, surfaces are isometric.
+    (Breiman et al., Classification and regression trees, 1984): where they do not tell, surfaces are isometric. Depths
+    are not stated to be more accurate than with the largest length noise that they do not refute.
 
     Only noise of the image points asks for it, and slants are settled before: while lengths are held tightly they
     hardly move. What is pulled as a whole is never pulled quite evenly; tighter lengths would predict what is near, and
@@ -76,10 +80,11 @@ def trusting_lengths(task: Task, found: Fit) -> Fit:
         errors.append(errors_under(noise))
         if gain(errors[-1], errors[best])[0] > 0.0:
             best = len(errors) - 1
-    halvings = max(level for level, of_level in enumerate(errors) if within_one_deviation(of_level, errors[best]))
-    for _ in range(halvings):
+    taken = max(level for level, of_level in enumerate(errors) if within(_TAKEN, of_level, errors[best]))
+    possible = min(level for level, of_level in enumerate(errors) if within(_REFUTED, of_level, errors[best]))
+    for _ in range(taken):
         found = refitted(task, found, found.noise.halved_length())
-    return found
+    return replace(found, length_doubt=2.0 ** (taken - possible))
 
 
 def noise_evidence(task: Task, found: Fit) -> dict[str, Any]:

@@ -41,23 +41,18 @@ def seen_frontally(task: Task, found: Fit) -> Fit:
     )
     priors = [replace(found.noise, patches=patches) for patches in task.config.frontal_patches]
     starts = [found, _flattened(found), *_inclined(task, found, priors[0])]
-    first = _cheapest(compared, starts, priors[0])
+    first = min((refitted(compared, start, priors[0]) for start in starts), key=lambda fit: fit.history[-1])
     without, other = (refitted(compared, start, found.noise) for start in (found, first))
     if other.history[-1] < without.history[-1]:
         found = without = other
     errors = HeldOut(without.shape, task.seen).errors(without.measurements)
     best, most, trial = found, 0.0, first
     for noise in priors:
-        trial = trial if trial.noise is noise else _cheapest(compared, [trial], noise)
+        trial = first if noise is priors[0] else refitted(compared, trial, noise)
         better_by, _ = gain(HeldOut(trial.shape, task.seen).errors(trial.measurements), errors)
         if better_by > most:
             best, most = trial, better_by
     return found if best is found else refitted(taken, best, best.noise)
-
-
-def _cheapest(task: Task, starts: list[Fit], noise: Noise) -> Fit:
-    """The fit from several starts that costs least."""
-    return min((refitted(task, start, noise) for start in starts), key=lambda fit: fit.history[-1])
 
 
 def _inclined(task: Task, found: Fit, noise: Noise) -> list[Fit]:

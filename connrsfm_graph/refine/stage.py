@@ -124,7 +124,7 @@ def _refined(found: Fit, config: RefineConfig, reference: Reference, outlier: np
     image, shape, seen, all_points = found.measurements.image, found.shape, reference.seen, reference.all_points
     deviation = np.full(seen.shape, np.nan)
     if config.uncertainty:
-        deviation = log_depth_deviation(found.measurements, shape, stretch=not found.noisy)
+        deviation = log_depth_deviation(found.doubted(found.measurements), shape, stretch=not found.noisy)
     warnings = []
     group = np.zeros(len(seen), dtype=int) if found.ambiguity is None else found.ambiguity.group
     if group.any():

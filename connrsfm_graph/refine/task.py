@@ -53,13 +53,16 @@ class Task:
 
     def flat(self) -> Task:
         """The same from flat views in front of the camera."""
-        return replace(self, completed=replace(self.completed, log_depth=np.zeros_like(self.completed.log_depth)))
+        return self.inclined(np.zeros(2))
 
     def inclined(self, slope: np.ndarray) -> Task:
-        """The same from views that are planes of a slope (2,), depth over image coordinates at depth one."""
+        """The same from views that are planes of a slope (2,), depth over image coordinates at depth one.
+
+        What would lie beyond the plane's horizon is put at ten times the depth of the middle.
+        """
         image = self.completed.image
-        nearness = 1.0 - (image - image.mean(axis=1, keepdims=True)) @ slope
-        return replace(self, completed=replace(self.completed, log_depth=-np.log(np.maximum(nearness, 0.1))))
+        nearness = np.maximum(1.0 - (image - image.mean(axis=1, keepdims=True)) @ slope, 0.1)
+        return replace(self, completed=replace(self.completed, log_depth=-np.log(nearness)))
 
     def spacing(self) -> float:
         """Median image length of the near edges."""
@@ -104,6 +107,8 @@ class Fit:
     """Cost of the best shape under the noise levels of the start."""
     noisy: bool = True
     """Whether the ray corrections look like noise."""
+    length_doubt: float = 1.0
+    """So many times larger the length noise might be for all that points left out say; deviations are stated for it."""
     evidence: dict[str, Any] = field(default_factory=dict)
     """What the choices rest on."""
     ambiguity: Ambiguity | None = None
@@ -119,6 +124,10 @@ class Fit:
         """(F, E) length residuals."""
         envelope = self.measurements.envelope(self.conformal)
         return linearise(self.measurements, self.shape, lag(self.measurements, self.shape), envelope)[1]
+
+    def doubted(self, measurements: Measurements) -> Measurements:
+        """Measurements with lengths held only as tightly as is beyond doubt, for deviations."""
+        return replace(measurements, length_weight=measurements.length_weight / self.length_doubt)
 
     def misfit(self) -> float:
         """Squared residuals of an isometric fit in assumed variances, on average over its degrees of freedom."""

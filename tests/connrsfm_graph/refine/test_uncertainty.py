@@ -20,7 +20,7 @@ def test_depth_errors_are_as_large_as_stated(seed):
     error = found.log_depth - scene.log_depth
     normalised = (error - np.median(error)) / (found.depth_std / np.exp(found.log_depth))
     # Errors of neighbours are alike: of the 800 depths some tens are independent.
-    assert 0.4 < (normalised**2).mean() < 2.2
+    assert 0.4 < (normalised**2).mean() < 1.8
     assert 0.87 < (np.abs(normalised) < 1.96).mean() < 0.995
 
 
