@@ -179,7 +179,7 @@ def test_what_keeps_its_lengths_is_nearer_to_the_truth(monkeypatch: pytest.Monke
     for least in (settle._LEAST, 1.0):
         monkeypatch.setattr(settle, "_LEAST", least)
         errors[least] = []
-        for seed in range(4):
+        for seed in range(2):
             scene = isometric_bending(n_frames=12, n_points=100, smooth=True, seed=seed)
             tracks = with_noise(scene.tracks, 1.0, seed=seed)
             flat, settings = np.zeros_like(scene.log_depth), RefineConfig(uncertainty=False)
