@@ -1,4 +1,4 @@
-"""Local shape of a view's mesh: arcs over its chords, and how it curves.
+"""Local shape of a view's mesh: its normals, and how it curves.
 
 Normals and curvatures come from a quadric about each vertex.
 """
@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-
-from factors.edge_length import arc_offset
 
 QUADRIC_RIDGE = 1e-2
 """Keeps the quadric about a vertex flat where it has too few neighbours to show its curvature."""
@@ -119,27 +117,10 @@ def _quadrics(X, triangles, edges, normal, axis, curvature):
 
 
 @njit(cache=True)
-def arc_offsets(X, edges, triangles, offset):
-    """Log ratio of arc to chord of every edge of one view."""
+def quadric_normals(X, triangles, edges, normal):
+    """Unit normals (P, 3) of one view by the quadrics about its vertices."""
     P = len(X)
-    normal = np.empty((P, 3))
     _quadrics(X, triangles, edges, normal, np.empty((P, 2, 3)), np.empty((P, 3)))
-    for e in range(len(edges)):
-        i, k = edges[e]
-        dx, dy, dz = X[k, 0] - X[i, 0], X[k, 1] - X[i, 1], X[k, 2] - X[i, 2]
-        size = np.sqrt(dx * dx + dy * dy + dz * dz)
-        offset[e] = 0.0
-        if size > 0.0:
-            rise_i = (normal[i, 0] * dx + normal[i, 1] * dy + normal[i, 2] * dz) / size
-            rise_k = (normal[k, 0] * dx + normal[k, 1] * dy + normal[k, 2] * dz) / size
-            offset[e] = arc_offset(np.arcsin(min(max(rise_i, -1.0), 1.0)), np.arcsin(min(max(rise_k, -1.0), 1.0)))
-
-
-@njit(cache=True, nogil=True)
-def arc_offset_kernel(first, last, X, triangles, edges, offset):
-    """Log ratio of arc to chord of every edge into `offset` (F, E), for views first to last - 1."""
-    for v in range(first, last):
-        arc_offsets(X[v], edges, triangles, offset[v])
 
 
 @njit(cache=True, nogil=True)

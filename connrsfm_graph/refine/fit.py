@@ -11,7 +11,7 @@ from connrsfm_graph.refine.caught import RESTARTS, reseated_where_dear, restarte
 from connrsfm_graph.refine.measurements import Measurements, Shape
 from connrsfm_graph.refine.noise import Noise
 from connrsfm_graph.refine.restarts import inverted, restart
-from connrsfm_graph.refine.settle import BEYOND_DOUBT, noise_evidence, settled, trusting_lengths
+from connrsfm_graph.refine.settle import BEYOND_DOUBT, noise_evidence, over_smooth_arcs, settled, trusting_lengths
 from connrsfm_graph.refine.slant import seen_frontally
 from connrsfm_graph.refine.start import start_shape
 from connrsfm_graph.refine.strain import stretched
@@ -73,8 +73,10 @@ def fit_isometric(task: Task, noise: Noise) -> Fit:
 
 
 def _finished(task: Task, isometric: Fit) -> Fit:
-    """The isometric fit that is taken, with the prior on slants and the trust in lengths that the data ask for."""
-    found = trusting_lengths(task, seen_frontally(task, isometric))
+    """The isometric fit that is taken, with the arcs, the prior on slants and the trust in lengths that the data ask
+    for."""
+    task, found = over_smooth_arcs(task, isometric)
+    found = trusting_lengths(task, seen_frontally(task, found))
     found.evidence.update(noise_evidence(task, found))
     return found
 

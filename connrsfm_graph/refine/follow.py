@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from connrsfm_graph.refine.arcs import ArcSplines
 from connrsfm_graph.refine.config import RefineConfig
 from connrsfm_graph.refine.measurements import Measurements, Shape, costs, lag
 from connrsfm_graph.refine.reseat import reseat
@@ -154,6 +155,7 @@ def _fitted(
         strain_weight=fit.measurements.strain_weight,
         mesh=fit.measurements.mesh,
         weights=fit.measurements.weights,
+        arcs=None if fit.measurements.arcs is None else ArcSplines.over(image),
     )
     shape, cost = fit_views(measurements, start, config.iterations, _TOLERANCE)
     factor, per_edge = _CAUGHT

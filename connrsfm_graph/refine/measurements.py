@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from connrsfm_graph.refine.arcs import ArcSplines, arc_offset_kernel
 from connrsfm_graph.refine.cost import Terms, Weights, cost_kernel, hinge_stencils, linearise_kernel
-from connrsfm_graph.refine.curvature import arc_offset_kernel
 from connrsfm_graph.refine.elimination import NormalEquations
 from connrsfm_graph.refine.envelope import Envelope, make_envelope
 from connrsfm_graph.refine.mesh import Mesh
@@ -74,6 +74,8 @@ class Measurements:
     """Edges and hinges."""
     weights: Weights
     """Inverse standard deviations of the other terms."""
+    arcs: ArcSplines | None = None
+    """What surfaces are smoothed by before arcs are measured over them; None where they are not."""
 
     def envelope(self, conformal: bool) -> Envelope:
         """Storage of the views' matrices."""
@@ -88,6 +90,7 @@ class Measurements:
             log_depth=self.log_depth[index],
             length_weight=self.length_weight[index],
             factor_weight=self.factor_weight[index],
+            arcs=None if self.arcs is None else self.arcs.views(index),
         )
 
     def replaced(self, index: np.ndarray, other: Measurements) -> Measurements:
@@ -96,7 +99,12 @@ class Measurements:
         parts = {name: getattr(self, name).copy() for name in names}
         for name, part in parts.items():
             part[index] = getattr(other, name)
-        return replace(self, **parts)
+        arcs = None if self.arcs is None or other.arcs is None else self.arcs.replaced(index, other.arcs)
+        return replace(self, **parts, arcs=arcs)
+
+    def splines(self) -> ArcSplines:
+        """As compiled code takes them."""
+        return ArcSplines.none(len(self.image)) if self.arcs is None else self.arcs
 
 
 @dataclass(frozen=True)
@@ -119,7 +127,7 @@ def lag(measurements: Measurements, shape: Shape) -> Lagged:
     offset = np.zeros((len(points), len(mesh.edges)))
     if shape.log_factor.size:
         return Lagged(offset, stencils)
-    over_views(arc_offset_kernel, len(points), points, mesh.triangles, mesh.edges, offset)
+    over_views(arc_offset_kernel, len(points), points, mesh.triangles, mesh.edges, measurements.splines(), offset)
     return Lagged(offset, stencils)
 
 

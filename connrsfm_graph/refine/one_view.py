@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from connrsfm_graph.refine.arcs import arc_offsets
 from connrsfm_graph.refine.cost import linearise_view, view_cost
-from connrsfm_graph.refine.curvature import arc_offsets
 from connrsfm_graph.refine.envelope import factor_damped, substitute
 
 
@@ -24,19 +24,20 @@ def _place(image, log_depth, correction, X):
 
 
 @njit(cache=True, inline="always")
-def _offset(X, edges, triangles, conformal, stretch, offset):
-    """What is added to the log chords of one view, into `offset` (E,)."""
+def _offset(X, edges, triangles, splines, v, conformal, stretch, offset):
+    """What is added to the log chords of view v, into `offset` (E,)."""
     if conformal:
         offset[:] = 0.0
     else:
-        arc_offsets(X, edges, triangles, offset)
+        columns, rows, smoothing = splines
+        arc_offsets(X, edges, triangles, columns[v], rows[v], smoothing[v], offset)
     offset -= stretch
 
 
 @njit(cache=True, nogil=True)
 def fit_views_kernel(
-    first, last, image, image_weight, anchor, length_weight, factor_weight, triangles, stretch, terms, envelope,
-    iterations, tolerance, exact, damping_range, log_depth, correction, log_factor, cost,
+    first, last, image, image_weight, anchor, length_weight, factor_weight, triangles, splines, stretch, terms,
+    envelope, iterations, tolerance, exact, damping_range, log_depth, correction, log_factor, cost,
 ):  # fmt: skip
     """Fit views first to last - 1.
 
@@ -44,6 +45,7 @@ def fit_views_kernel(
         image, image_weight, length_weight, factor_weight: as in `measurements.Measurements`.
         anchor: (F, P) log depths about which those of the shape may drift.
         triangles: (T, 3) of the mesh.
+        splines: what views are smoothed by before arcs are measured over them.
         stretch: (F, E) changes of log lengths in the views.
         terms: what all views share.
         envelope: storage of a view's matrix.
@@ -66,7 +68,7 @@ def fit_views_kernel(
         damping = damping_range[0]
         for _ in range(iterations):
             _place(image[v], b, q, X)
-            _offset(X, terms.edges, triangles, conformal, stretch[v], offset)
+            _offset(X, terms.edges, triangles, splines, v, conformal, stretch[v], offset)
             before = view_cost(X, f, b - anchor[v], offset, q, *of_view)
             linearise_view(X, f, b - anchor[v], offset, q, *of_view, envelope, matrix, step, border, residual, weight)
             after = np.inf
@@ -89,5 +91,5 @@ def fit_views_kernel(
             if before - after <= tolerance * before or after <= exact:
                 break
         _place(image[v], b, q, X)
-        _offset(X, terms.edges, triangles, conformal, stretch[v], offset)
+        _offset(X, terms.edges, triangles, splines, v, conformal, stretch[v], offset)
         cost[v] = view_cost(X, f, b - anchor[v], offset, q, *of_view)

@@ -52,6 +52,20 @@ def settled(task: Task, found: Fit) -> Fit:
     return replace(found, noisy=noisy)
 
 
+def over_smooth_arcs(task: Task, found: Fit) -> tuple[Task, Fit]:
+    """A settled isometric fit with arcs measured over smoothed surfaces (see `arcs`), and the task with it.
+
+    Only noise of the image points asks for it. It stays unless points left out are predicted worse by more than a
+    standard error, as on a surface whose wrinkles the smoothing would remove.
+    """
+    if not found.noisy or found.misfit() < BEYOND_DOUBT:
+        return task, found
+    smooth = task.smoothed(found.shape)
+    again = refitted(smooth, found, found.noise)
+    rough, errors = (HeldOut(fit.shape, task.seen).errors(fit.measurements) for fit in (found, again))
+    return (smooth, again) if within(_TAKEN, errors, rough) else (task, found)
+
+
 def trusting_lengths(task: Task, found: Fit) -> Fit:
     """A settled fit with half the length noise, again and again, as far as points left out have nothing against it.
 
@@ -100,4 +114,5 @@ def noise_evidence(task: Task, found: Fit) -> dict[str, Any]:
         "correlation of neighbours' ray corrections": neighbour_correlation(correction, task.seen, task.mesh)[0],
         "median absolute length residual": float(np.median(np.abs(found.residuals()))),
         "bending": task.config.bending,
+        "arcs over smoothed surfaces": task.arcs is not None,
     }

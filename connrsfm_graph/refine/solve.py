@@ -136,6 +136,7 @@ def fit_views(measurements: Measurements, shape: Shape, iterations: int, toleran
         measurements.length_weight,
         measurements.factor_weight,
         mesh.triangles,
+        measurements.splines(),
         stretches(shape.strain, mesh)[0],
         terms_of(measurements, shape, stencils_of(measurements, shape)),
         envelope,

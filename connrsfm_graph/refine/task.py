@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from connrsfm_graph.refine.ambiguity import Ambiguity
+from connrsfm_graph.refine.arcs import ArcSplines
 from connrsfm_graph.refine.config import RefineConfig
 from connrsfm_graph.refine.cost import Weights
 from connrsfm_graph.refine.measurements import Measurements, Shape, lag, linearise
@@ -40,6 +41,8 @@ class Task:
     """Neighbours."""
     config: RefineConfig
     """Settings."""
+    arcs: ArcSplines | None = None
+    """What surfaces are smoothed by before arcs are measured over them; None where they are not."""
 
     @staticmethod
     def of(completed: Completed, seen: np.ndarray, config: RefineConfig) -> Task:
@@ -63,6 +66,10 @@ class Task:
         image = self.completed.image
         nearness = np.maximum(1.0 - (image - image.mean(axis=1, keepdims=True)) @ slope, 0.1)
         return replace(self, completed=replace(self.completed, log_depth=-np.log(nearness)))
+
+    def smoothed(self, shape: Shape) -> Task:
+        """The same with arcs over surfaces that are smoothed over the corrected image points of a shape."""
+        return replace(self, arcs=ArcSplines.over(self.completed.image + shape.correction))
 
     def spacing(self) -> float:
         """Median image length of the near edges."""
@@ -91,6 +98,7 @@ class Task:
                 unit=_UNIT,
                 frontal=0.0 if conformal else PER_PATCH * noise.patches / len(self.mesh.edges),
             ),
+            arcs=self.arcs,
         )
 
 
