@@ -20,9 +20,8 @@ _LOOSE = 2.0
 _IN_VAIN = 2
 """So often the assumed length noise is halved although points left out are predicted worse: the next halving may tell
 another thing."""
-_TAKEN, _REFUTED = 1.0, 2.0
-"""By so many standard errors points left out are predicted worse than with the best length noise, at most with the one
-that is taken, and at least with one that is refuted."""
+_REFUTED = 1.0
+"""What predicts points left out worse than the best does, by more than so many standard errors, is refuted."""
 _LEAST = 0.005
 """Below this part of what it was assumed to be at first it is not halved again."""
 
@@ -63,7 +62,7 @@ def over_smooth_arcs(task: Task, found: Fit) -> tuple[Task, Fit]:
     smooth = task.smoothed(found.shape)
     again = refitted(smooth, found, found.noise)
     rough, errors = (HeldOut(fit.shape, task.seen).errors(fit.measurements) for fit in (found, again))
-    return (smooth, again) if within(_TAKEN, errors, rough) else (task, found)
+    return (smooth, again) if within(_REFUTED, errors, rough) else (task, found)
 
 
 def trusting_lengths(task: Task, found: Fit) -> Fit:
@@ -94,11 +93,10 @@ def trusting_lengths(task: Task, found: Fit) -> Fit:
         errors.append(errors_under(noise))
         if gain(errors[-1], errors[best])[0] > 0.0:
             best = len(errors) - 1
-    taken = max(level for level, of_level in enumerate(errors) if within(_TAKEN, of_level, errors[best]))
-    possible = min(level for level, of_level in enumerate(errors) if within(_REFUTED, of_level, errors[best]))
-    for _ in range(taken):
+    possible = [level for level, of_level in enumerate(errors) if within(_REFUTED, of_level, errors[best])]
+    for _ in range(possible[-1]):
         found = refitted(task, found, found.noise.halved_length())
-    return replace(found, length_doubt=2.0 ** (taken - possible))
+    return replace(found, length_doubt=2.0 ** (possible[-1] - possible[0]))
 
 
 def noise_evidence(task: Task, found: Fit) -> dict[str, Any]:
