@@ -48,7 +48,7 @@ class ArcSplines(NamedTuple):
             spline = SurfaceSpline(image[view], (VALUE,), one, one[:, 0], image[view], _CONTROL_POINTS, PERSPECTIVE)
             first, rows = spline.grid.rows(image[view])
             lower, _ = spline.normal_equations()
-            lower += _BENDING * P * np.tril(spline.bending)
+            lower += _BENDING * P * spline.bending
             normal = np.tril(lower) + np.tril(lower, -1).T
             return first[:, None] + spline.grid.patch(), rows[:, (VALUE, U, V)], np.linalg.inv(normal)
 

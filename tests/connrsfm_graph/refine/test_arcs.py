@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from connrsfm_graph.metrics import evaluate
-from connrsfm_graph.refine import RefineConfig, fit, refine
+from connrsfm_graph.refine import RefineConfig, fit, refine, settle
 from connrsfm_graph.refine.arcs import ArcSplines, arc_offset_kernel
-from connrsfm_graph.refine.measurements import lag
+from connrsfm_graph.refine.measurements import Measurements, lag
 from connrsfm_graph.refine.mesh import Mesh, surface_mesh
 from connrsfm_graph.refine.restarts import restart
 from connrsfm_graph.refine.solve import fit_views, minimise
@@ -77,6 +77,20 @@ def test_a_plane_has_no_arcs_however_it_leans() -> None:
         assert np.abs(offsets(image, log_depth, mesh, ArcSplines.over(image))).max() < 2e-4
 
 
+def test_waves_of_a_third_of_the_image_are_halved_and_longer_ones_stay() -> None:
+    rng = np.random.default_rng(0)
+    image = rng.uniform(0.0, 1.0, (1, 300, 2))
+    columns, rows, smoothing = (part[0] for part in ArcSplines.over(image))
+    inside = (np.abs(image[0] - 0.5) < 0.3).all(axis=1)
+    for length, least, most in ((0.33, 0.3, 0.6), (0.8, 0.9, 1.05), (0.15, 0.0, 0.15)):
+        wave = np.sin(2.0 * np.pi * image[0, :, 0] / length)
+        right = np.zeros(len(smoothing))
+        np.add.at(right, columns, rows[:, 0] * wave[:, None])
+        smooth = (rows[:, 0] * (smoothing @ right)[columns]).sum(axis=1)
+        left = (smooth @ (wave * inside)) / (wave @ (wave * inside))
+        assert least < left < most
+
+
 def test_points_at_one_place_are_no_trouble() -> None:
     image, log_depth, mesh = ball(n_points=40)
     image[:, 1], log_depth[:, 1] = image[:, 0], log_depth[:, 0]
@@ -108,6 +122,24 @@ def test_one_by_one_and_jointly_views_have_the_same_arcs() -> None:
     again, renewed = restart(measurements.views(view), shape.replaced(view, flat.views(view)).views(view))
     assert renewed.all()
     assert np.isfinite(again.log_depth).all()
+
+
+@pytest.mark.parametrize("refuted", [False, True])
+def test_points_left_out_may_refute_it(refuted: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    _, task, found = noisy_sheet()
+    errors = np.random.default_rng(0).chisquare(2, 500)
+
+    def predicted(self: settle.HeldOut, measurements: Measurements) -> np.ndarray:
+        return errors * (1.1 if refuted and measurements.arcs is not None else 1.0)
+
+    monkeypatch.setattr(settle.HeldOut, "errors", predicted)
+    assert found.noisy
+    smooth, again = settle.over_smooth_arcs(task, found)
+    if refuted:
+        assert smooth is task
+        assert again is found
+    else:
+        assert smooth.arcs is again.measurements.arcs is not None
 
 
 def refined_error(tracks: Tracks, pixels: float) -> tuple[float, bool]:
