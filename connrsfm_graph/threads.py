@@ -19,7 +19,8 @@ _RANGES = 4
 
 @cache
 def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, thread_name_prefix="connrsfm")
+    """Threads that work alone: what one of them calls is not shared out again."""
+    return ThreadPoolExecutor(threads, "connrsfm", initializer=numba.set_num_threads, initargs=(1,))
 
 
 def over_views(kernel: Callable[..., None], n_views: int, *arguments: Any) -> None:
@@ -46,7 +47,11 @@ def over_views(kernel: Callable[..., None], n_views: int, *arguments: Any) -> No
 
 
 def mapped(function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
-    """function(item) of every item, in order. It pays where most time goes to code that releases the interpreter."""
+    """function(item) of every item, in order, each on a thread of its own; what it calls `over_views` stays there.
+
+    It pays where most time goes to code that releases the interpreter. Of many small views it makes better use of the
+    threads than sharing out the views of one item after the other.
+    """
     if numba.get_num_threads() == 1:
         return map(function, items)
     return _pool(numba.get_num_threads()).map(function, items)

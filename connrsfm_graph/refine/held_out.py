@@ -7,19 +7,22 @@ neighbours' points, lengths trusted too little pass nothing on.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
 
 from connrsfm_graph.refine.measurements import Measurements, Shape
 from connrsfm_graph.refine.solve import minimise
+from connrsfm_graph.refine.task import Fit
+from connrsfm_graph.threads import mapped
 
 _PARTS, _USED, _ENOUGH = 5, 3, 1000
 """Observations are dealt out at random to so many parts, of which so many are left out in turn, fewer if those hold
 enough observations."""
 _LEFT_OUT = 1e-2
 """Factor on the weight of an image point that is left out: enough to keep it where nothing else holds it."""
-_FIRST, _NEXT, _TOLERANCE = 24, 6, 1e-4
+_FIRST, _NEXT, _TOLERANCE = 24, 12, 1e-4
 """Iterations at most of each part's first fit and of those that follow, and their tolerance. They are close ones: a fit
 that has not yet forgotten a point predicts it too well, and the better the tighter its lengths are held."""
 _GROSS = 9.0
@@ -46,16 +49,21 @@ class HeldOut:
 
     def errors(self, measurements: Measurements) -> np.ndarray:
         """(N,) squared distances of image points from where the fit to the others puts them."""
-        errors = []
-        for number, last in enumerate(self._fits):
-            left_out = self._part == number
-            weight = np.where(left_out, _LEFT_OUT, 1.0) * measurements.image_weight
+
+        def without(number: int) -> Shape:
+            weight = np.where(self._part == number, _LEFT_OUT, 1.0) * measurements.image_weight
             others = replace(measurements, image_weight=weight)
-            fit, _ = minimise(others, last, self._iterations, _TOLERANCE, closely=True)
-            errors.append((fit.correction[left_out] ** 2).sum(axis=-1))
-            self._fits[number] = fit
+            return minimise(others, self._fits[number], self._iterations, _TOLERANCE, closely=True)[0]
+
+        self._fits = list(mapped(without, range(len(self._fits))))
         self._iterations = _NEXT
-        return np.concatenate(errors)
+        left_out = (fit.correction[self._part == number] for number, fit in enumerate(self._fits))
+        return np.concatenate([(correction**2).sum(axis=-1) for correction in left_out])
+
+
+def errors_of(fits: Iterable[Fit], seen: np.ndarray) -> list[np.ndarray]:
+    """(N,) squared distances at the same points for each of some fits; see `HeldOut`."""
+    return list(mapped(lambda fit: HeldOut(fit.shape, seen).errors(fit.measurements), fits))
 
 
 def gain(errors: np.ndarray, than: np.ndarray) -> tuple[float, float]:

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from connrsfm_graph.refine.held_out import HeldOut, gain, within
-from connrsfm_graph.refine.noise import Noise, neighbour_correlation
+from connrsfm_graph.refine.held_out import HeldOut, errors_of, gain, within
+from connrsfm_graph.refine.noise import LENGTH_STEP, Noise, neighbour_correlation
+from connrsfm_graph.refine.solve import minimise
 from connrsfm_graph.refine.task import Fit, Task, refitted
 
 BEYOND_DOUBT = 0.05
@@ -17,13 +18,13 @@ _ROUNDS = 4
 """Fits with noise levels that the one before has shown, at most."""
 _LOOSE = 2.0
 """Edges of so many times the length noise of others are called loose."""
-_IN_VAIN = 2
-"""So often the assumed length noise is halved although points left out are predicted worse: the next halving may tell
-another thing."""
 _REFUTED = 1.0
 """What predicts points left out worse than the best does, by more than so many standard errors, is refuted."""
 _LEAST = 0.005
-"""Below this part of what it was assumed to be at first it is not halved again."""
+"""Below this part of what it was assumed to be at first it is not lowered again."""
+_CLOSE = (60, 1e-5)
+"""Iterations at most and tolerance of the fit that is taken in the end: where lengths are held tightly the last steps
+are small and many."""
 
 
 def settled(task: Task, found: Fit) -> Fit:
@@ -61,12 +62,12 @@ def over_smooth_arcs(task: Task, found: Fit) -> tuple[Task, Fit]:
         return task, found
     smooth = task.smoothed(found.shape)
     again = refitted(smooth, found, found.noise)
-    rough, errors = (HeldOut(fit.shape, task.seen).errors(fit.measurements) for fit in (found, again))
+    rough, errors = errors_of((found, again), task.seen)
     return (smooth, again) if within(_REFUTED, errors, rough) else (task, found)
 
 
 def trusting_lengths(task: Task, found: Fit) -> Fit:
-    """A settled fit with half the length noise, again and again, as far as points left out have nothing against it.
+    """A settled fit with a quarter of the length noise, again and again, as far as points left out do not object.
 
     That tells what keeps its lengths, as paper does, from what stretches a little. Taken is the least length noise with
     which they are predicted within one standard error as well as with the best, the usual rule of cross-validation
@@ -84,19 +85,20 @@ def trusting_lengths(task: Task, found: Fit) -> Fit:
     def errors_under(noise: Noise) -> np.ndarray:
         return left_out.errors(task.measurements(noise, conformal=found.conformal))
 
-    half = noise.halved_length()
-    for level in (noise, half, half.halved_length(), half):
+    for level in (noise, noise.tighter_length()):
         errors_under(level)  # fits have something left of the points left out until they have been elsewhere
     errors, best = [errors_under(noise)], 0
-    while len(errors) - 1 - best < _IN_VAIN and noise.length > _LEAST * task.config.length_sigma:
-        noise = noise.halved_length()
+    while best == len(errors) - 1 and noise.length > _LEAST * task.config.length_sigma:
+        noise = noise.tighter_length()
         errors.append(errors_under(noise))
         if gain(errors[-1], errors[best])[0] > 0.0:
             best = len(errors) - 1
     possible = [level for level, of_level in enumerate(errors) if within(_REFUTED, of_level, errors[best])]
     for _ in range(possible[-1]):
-        found = refitted(task, found, found.noise.halved_length())
-    return replace(found, length_doubt=2.0 ** (possible[-1] - possible[0]))
+        found = refitted(task, found, found.noise.tighter_length())
+    shape, more = minimise(found.measurements, found.shape, *_CLOSE, closely=True)
+    doubt = LENGTH_STEP ** (possible[-1] - possible[0])
+    return replace(found, shape=shape, history=found.history + more, length_doubt=doubt)
 
 
 def noise_evidence(task: Task, found: Fit) -> dict[str, Any]:

@@ -11,11 +11,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from connrsfm_graph.refine.held_out import HeldOut, gain
+from connrsfm_graph.refine.held_out import errors_of, gain
 from connrsfm_graph.refine.noise import Noise
 from connrsfm_graph.refine.settle import BEYOND_DOUBT
 from connrsfm_graph.refine.start import start_shape
 from connrsfm_graph.refine.task import Fit, Task, refitted
+from connrsfm_graph.threads import mapped
 
 _COMPARED, _TAKEN = (12, 3e-4), (60, 1e-4)
 """Iterations at most and tolerance of the fits that are compared, and of the one that is taken: slants move last."""
@@ -41,15 +42,17 @@ def seen_frontally(task: Task, found: Fit) -> Fit:
     )
     priors = [replace(found.noise, patches=patches) for patches in task.config.frontal_patches]
     starts = [found, _flattened(found), *_inclined(task, found, priors[0])]
-    first = min((refitted(compared, start, priors[0]) for start in starts), key=lambda fit: fit.history[-1])
-    without, other = (refitted(compared, start, found.noise) for start in (found, first))
+    first = min(mapped(lambda start: refitted(compared, start, priors[0]), starts), key=lambda fit: fit.history[-1])
+    without, other = mapped(lambda start: refitted(compared, start, found.noise), (found, first))
     if other.history[-1] < without.history[-1]:
         found = without = other
-    errors = HeldOut(without.shape, task.seen).errors(without.measurements)
-    best, most, trial = found, 0.0, first
-    for noise in priors:
-        trial = first if noise is priors[0] else refitted(compared, trial, noise)
-        better_by, _ = gain(HeldOut(trial.shape, task.seen).errors(trial.measurements), errors)
+    trials = [first]
+    for noise in priors[1:]:
+        trials.append(refitted(compared, trials[-1], noise))
+    errors, *under_priors = errors_of((without, *trials), task.seen)
+    best, most = found, 0.0
+    for trial, under_prior in zip(trials, under_priors, strict=True):
+        better_by, _ = gain(under_prior, errors)
         if better_by > most:
             best, most = trial, better_by
     return found if best is found else refitted(taken, best, best.noise)
@@ -62,12 +65,14 @@ def _inclined(task: Task, found: Fit, noise: Noise) -> list[Fit]:
     """
     iterations, kept = _PROMISING
     quick = replace(task, config=replace(task.config, iterations=iterations))
-    fits = []
-    for angle in 2.0 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS:
+
+    def from_plane(angle: float) -> Fit:
         slope = np.tan(np.radians(_INCLINATION)) * np.array([np.cos(angle), np.sin(angle)])
         plane = start_shape(task.inclined(slope).completed, task.mesh)
         plane = replace(plane, strain=np.zeros_like(found.shape.strain))
-        fits.append(refitted(quick, replace(found, shape=plane), noise))
+        return refitted(quick, replace(found, shape=plane), noise)
+
+    fits = mapped(from_plane, 2.0 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS)
     return sorted(fits, key=lambda fit: fit.history[-1])[:kept]
 
 

@@ -23,6 +23,7 @@ from connrsfm_graph.refine.noise import Noise
 from connrsfm_graph.refine.settle import BEYOND_DOUBT, settled
 from connrsfm_graph.refine.start import log_chords, start_shape
 from connrsfm_graph.refine.task import Fit, Task, minimised
+from connrsfm_graph.threads import mapped
 
 _PROMISING = 1.2
 """Strains must lower the cost by this factor to be looked into: a little they always lower it."""
@@ -77,7 +78,7 @@ def stretched(task: Task, found: Fit, noise: Noise) -> tuple[Task, Fit]:
 
 def _cheapest(task: Task, found: Fit) -> Fit:
     """The cheapest of the fits with strains from several starts; views that are caught in a wrong shape start again."""
-    best = min((_minimum(task, found, start) for start in _starts(task, found)), key=lambda fit: fit.first_cost)
+    best = min(mapped(lambda start: _minimum(task, found, start), _starts(task, found)), key=lambda fit: fit.first_cost)
     return reseated_where_dear(task, restarted_where_dear(task, best, lend=True))
 
 
