@@ -22,9 +22,9 @@ _PARTS, _USED, _ENOUGH = 5, 3, 1000
 enough observations."""
 _LEFT_OUT = 1e-2
 """Factor on the weight of an image point that is left out: enough to keep it where nothing else holds it."""
-_FIRST, _NEXT, _TOLERANCE = 24, 12, 1e-4
-"""Iterations at most of each part's first fit and of those that follow, and their tolerance. They are close ones: a fit
-that has not yet forgotten a point predicts it too well, and the better the tighter its lengths are held."""
+_ITERATIONS, _TOLERANCE = 24, 1e-4
+"""At most so many of each fit, and its tolerance. They are close ones: what has not yet forgotten a point
+predicts it too well, and the more so the tighter its lengths are held."""
 _GROSS = 9.0
 """Squared errors count up to this many times their median: wrong tracks predict nothing."""
 
@@ -45,7 +45,6 @@ class HeldOut:
         self._part = np.where(seen, np.random.default_rng(0).integers(_PARTS, size=seen.shape), _PARTS)
         size = np.cumsum([np.count_nonzero(self._part == number) for number in range(_USED)])
         self._fits = [shape] * min(_USED, 1 + int(np.searchsorted(size, _ENOUGH)))
-        self._iterations = _FIRST
 
     def errors(self, measurements: Measurements) -> np.ndarray:
         """(N,) squared distances of image points from where the fit to the others puts them."""
@@ -53,10 +52,9 @@ class HeldOut:
         def without(number: int) -> Shape:
             weight = np.where(self._part == number, _LEFT_OUT, 1.0) * measurements.image_weight
             others = replace(measurements, image_weight=weight)
-            return minimise(others, self._fits[number], self._iterations, _TOLERANCE, closely=True)[0]
+            return minimise(others, self._fits[number], _ITERATIONS, _TOLERANCE, closely=True)[0]
 
         self._fits = list(mapped(without, range(len(self._fits))))
-        self._iterations = _NEXT
         left_out = (fit.correction[self._part == number] for number, fit in enumerate(self._fits))
         return np.concatenate([(correction**2).sum(axis=-1) for correction in left_out])
 

@@ -163,7 +163,7 @@ def test_fits_that_are_compared_have_forgotten_the_points_left_out(monkeypatch: 
     with monkeypatch.context() as patch:
         patch.setattr(held_out, "minimise", lambda *arguments, closely: minimise(*arguments))
         loose = errors()
-    for name, value in {"_FIRST": 100, "_NEXT": 100, "_TOLERANCE": 1e-6}.items():
+    for name, value in {"_ITERATIONS": 100, "_TOLERANCE": 1e-6}.items():
         monkeypatch.setattr(held_out, name, value)
     monkeypatch.setattr("connrsfm_graph.refine.solve._CLOSE_TOLERANCE", 0.01)
     thorough = errors()
@@ -191,7 +191,7 @@ def test_what_keeps_its_lengths_is_nearer_to_the_truth(monkeypatch: pytest.Monke
 def test_exact_data_are_beyond_doubt(monkeypatch: pytest.MonkeyPatch) -> None:
     """They leave nothing that points left out could tell."""
 
-    def never(*arguments: object) -> np.ndarray:
+    def never(*arguments: object, closely: bool) -> np.ndarray:
         raise AssertionError("points were left out")
 
     monkeypatch.setattr(held_out, "minimise", never)
