@@ -13,8 +13,6 @@ import numpy as np
 
 from connrsfm_graph.refine.mesh import Mesh
 
-LENGTH_STEP = 4.0
-"""Between levels of the length noise that are compared."""
 _LEAST_IMAGE = 1e-4
 """Smallest image noise, relative to the median image length of a mesh edge."""
 _OVERESTIMATED = 0.7
@@ -83,9 +81,9 @@ class Noise:
             return self
         return replace(self, image=max(shown, self.least))
 
-    def tighter_length(self) -> Noise:
-        """With less length noise, by a step."""
-        return replace(self, length=self.length / LENGTH_STEP)
+    def tighter(self, times: float) -> Noise:
+        """With so many times less length noise."""
+        return replace(self, length=self.length / times)
 
     def after_fit(self, residual: np.ndarray, seen: np.ndarray) -> Noise:
         """With the robust threshold and the loose edges that length residuals show, and interpolated points released.

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from connrsfm_graph.refine.held_out import HeldOut, errors_of, gain, within
-from connrsfm_graph.refine.noise import LENGTH_STEP, Noise, neighbour_correlation
+from connrsfm_graph.refine.noise import Noise, neighbour_correlation
 from connrsfm_graph.refine.solve import minimise
 from connrsfm_graph.refine.task import Fit, Task, refitted
 
@@ -20,6 +20,8 @@ _LOOSE = 2.0
 """Edges of so many times the length noise of others are called loose."""
 _REFUTED = 1.0
 """What predicts points left out worse than the best does, by more than so many standard errors, is refuted."""
+_STEP = 4.0
+"""Between levels of the length noise that are compared; in the end one is looked at that lies between two."""
 _LEAST = 0.005
 """Below this part of what it was assumed to be at first it is not lowered again."""
 _CLOSE = (60, 1e-5)
@@ -85,19 +87,24 @@ def trusting_lengths(task: Task, found: Fit) -> Fit:
     def errors_under(noise: Noise) -> np.ndarray:
         return left_out.errors(task.measurements(noise, conformal=found.conformal))
 
-    for level in (noise, noise.tighter_length()):
+    for level in (noise, noise.tighter(_STEP)):
         errors_under(level)  # fits have something left of the points left out until they have been elsewhere
-    errors, best = [errors_under(noise)], 0
-    while best == len(errors) - 1 and noise.length > _LEAST * task.config.length_sigma:
-        noise = noise.tighter_length()
-        errors.append(errors_under(noise))
+    levels, errors, best = [noise], [errors_under(noise)], 0
+    while best == len(errors) - 1 and levels[-1].length > _LEAST * task.config.length_sigma:
+        levels.append(levels[-1].tighter(_STEP))
+        errors.append(errors_under(levels[-1]))
         if gain(errors[-1], errors[best])[0] > 0.0:
             best = len(errors) - 1
-    possible = [level for level, of_level in enumerate(errors) if within(_REFUTED, of_level, errors[best])]
-    for _ in range(possible[-1]):
-        found = refitted(task, found, found.noise.tighter_length())
+    possible = [level for level, tried in zip(levels, errors, strict=True) if within(_REFUTED, tried, errors[best])]
+    taken = possible[-1]
+    if taken is not levels[-1]:
+        between = taken.tighter(_STEP**0.5)
+        if within(_REFUTED, errors_under(between), errors[best]):
+            taken = between
+    for level in (*(level for level in levels[1:] if level.length > taken.length), taken):
+        found = refitted(task, found, level)
     shape, more = minimise(found.measurements, found.shape, *_CLOSE, closely=True)
-    doubt = LENGTH_STEP ** (possible[-1] - possible[0])
+    doubt = possible[0].length / taken.length
     return replace(found, shape=shape, history=found.history + more, length_doubt=doubt)
 
 

@@ -123,16 +123,18 @@ def test_fits_go_on_from_those_before() -> None:
 @pytest.mark.parametrize(
     ("predicted", "taken"),
     [
-        ((-0.1, 0.2), 0.01),
-        ((0.0, 0.2), 0.01 / 4),
-        ((0.2, 0.4, 0.3, 0.5), 0.01 / 4**2),
-        ((0.1, 0.2, 0.3, 0.4), 0.01 / 4**4),
+        ((-0.05, -0.1, 0.0, 0.2), 0.01),
+        ((0.0, -0.1, 0.0, 0.2), 0.01 / 2),
+        ((0.0, 0.0, -0.1, -0.1), 0.01 / 4),
+        ((0.1, 0.2, 0.3, 0.4, 0.4, 0.3, 0.5, 0.5), 0.01 / 2**5),
+        (tuple(0.1 * n for n in range(1, 9)), 0.01 / 2**8),
     ],
 )
 def test_the_least_length_noise_that_predicts_as_well_as_the_best_is_taken(
     monkeypatch: pytest.MonkeyPatch, predicted: tuple[float, ...], taken: float
 ) -> None:
-    """`predicted`: how much better than at first, step after step, to the first in vain or that to the least noise."""
+    """`predicted`: how much better than at first, halving after halving. Two make a step, up to the first in vain; one
+    is looked at between the last and what is refuted."""
     scene = isometric_bending(n_frames=6, n_points=60, seed=1)
     tracks = with_noise(scene.tracks, PIXELS, seed=1)
     errors = np.random.default_rng(0).chisquare(2, 500)
@@ -140,7 +142,7 @@ def test_the_least_length_noise_that_predicts_as_well_as_the_best_is_taken(
 
     class Canned(HeldOut):
         def errors(self, measurements: Measurements) -> np.ndarray:
-            return np.asarray((1.0 - better[round(np.log2(0.01 * measurements.length_weight.max()) / 2)]) * errors)
+            return np.asarray((1.0 - better[round(np.log2(0.01 * measurements.length_weight.max()))]) * errors)
 
     monkeypatch.setattr("connrsfm_graph.refine.settle.HeldOut", Canned)
     sigma = PIXELS / tracks.focal_length()
