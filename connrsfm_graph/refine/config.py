@@ -29,7 +29,7 @@ class RefineConfig:
     """Standard deviation of the difference of log conformal factor between neighbours, for the conformal model."""
     stretched: Stretched = "auto"
     """Whether, in the isometric model, each view may also be pulled as a whole along one direction: `yes`, `no`, or
-    `auto`, where isometry misses the data and that explains by far the most of it."""
+    `auto`, where isometry misses the data and points left out are predicted far better with it."""
     strain_sigma: float = 0.2
     """Standard deviation of the two numbers of such a pull, a homogeneous strain."""
     rings: int = 2

@@ -8,6 +8,7 @@ cost. This is what makes the work linear in the views, in any order and in paral
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from connrsfm_graph.refine.resection import moved_rigidly
 from connrsfm_graph.refine.restarts import inverted, restart
 from connrsfm_graph.refine.solve import fit_views, minimise
 from connrsfm_graph.refine.task import Fit
-from connrsfm_graph.refine.uncertainty import log_depth_deviation
+from connrsfm_graph.refine.uncertainty import log_depth_deviation, pull
 from connrsfm_graph.refine.unseen import Template, complete_images
 from connrsfm_graph.refine.wrong_tracks import wrong_tracks
 
@@ -50,6 +51,11 @@ class Reference:
         """Median cost of a view."""
         measurements, shape = self.fit.measurements, self.fit.shape
         return float(np.median(costs(measurements, shape, lag(measurements, shape))))
+
+    @cached_property
+    def lengths_pull(self) -> np.ndarray:
+        """(E,) by how much the prior on slants moves the log lengths, see `uncertainty.pull`."""
+        return pull(self.fit.doubted(self.fit.measurements), self.fit.shape)[1]
 
     def gross(self) -> float:
         """Length beyond which a ray correction means a wrong track."""
@@ -111,7 +117,7 @@ def follow(
         measurements, shape = measurements.replaced(again, part[0]), shape.replaced(again, part[1])
     deviation = np.full(visible.shape, np.nan)
     if config.uncertainty:
-        deviation = log_depth_deviation(fit.doubted(measurements), shape, stretch=not fit.noisy, jointly=False)
+        deviation = log_depth_deviation(fit.doubted(measurements), shape, not fit.noisy, reference.lengths_pull)
     group = np.zeros(len(visible), dtype=int) if fit.ambiguity is None else fit.ambiguity.group[nearest]
     alternative = None
     if fit.alternative is not None:

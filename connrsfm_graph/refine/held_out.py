@@ -68,12 +68,23 @@ def gain(errors: np.ndarray, than: np.ndarray) -> tuple[float, float]:
     """Mean by which squared errors (N,) are smaller than others at the same points, and its standard error."""
     if len(errors) == 0:
         return 0.0, 0.0
-    most = _GROSS * float(np.median(than))
-    difference = np.minimum(than, most) - np.minimum(errors, most)
+    difference = _capped(than, than) - _capped(errors, than)
     return float(difference.mean()), float(difference.std()) / float(np.sqrt(len(difference)))
+
+
+def clearly_better(part: float, deviations: float, errors: np.ndarray, than: np.ndarray) -> bool:
+    """Whether squared errors (N,) are smaller than others by more than a part of these, and by more than so many
+    standard errors of the difference."""
+    better_by, deviation = gain(errors, than)
+    return better_by > 0.0 and better_by > max(part * float(_capped(than, than).mean()), deviations * deviation)
 
 
 def within(deviations: float, errors: np.ndarray, best: np.ndarray) -> bool:
     """Whether squared errors (N,) are larger than the best by at most so many standard errors of the difference."""
     better_by, deviation = gain(errors, best)
     return better_by >= -deviations * deviation
+
+
+def _capped(errors: np.ndarray, than: np.ndarray) -> np.ndarray:
+    """Squared errors as they count where they are compared with others."""
+    return np.minimum(errors, _GROSS * float(np.median(than)))

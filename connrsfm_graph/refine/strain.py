@@ -18,6 +18,7 @@ import numpy as np
 
 from connrsfm_graph.refine.caught import reseated_where_dear, restarted_where_dear
 from connrsfm_graph.refine.flatten import flattened
+from connrsfm_graph.refine.held_out import clearly_better, errors_of
 from connrsfm_graph.refine.measurements import Shape
 from connrsfm_graph.refine.noise import Noise
 from connrsfm_graph.refine.settle import BEYOND_DOUBT, settled
@@ -25,10 +26,10 @@ from connrsfm_graph.refine.start import log_chords, start_shape
 from connrsfm_graph.refine.task import Fit, Task, minimised
 from connrsfm_graph.threads import mapped
 
-_PROMISING = 1.2
+_PROMISING = 1.1
 """Strains must lower the cost by this factor to be looked into: a little they always lower it."""
-_ENOUGH, _PLENTY = 1.3, 3.0
-"""By the first factor where the ray corrections then look like noise, else by the second."""
+_PART, _SURE = 1.0 / 6.0, 3.0
+"""Taken are strains with which points left out are predicted better by this part, and so many standard errors."""
 _PULLED = (0.0, 0.5)
 """Parts of what distinguishes the images of flat views that are taken for pulls at the start."""
 _ROUNDS = 4
@@ -38,10 +39,11 @@ _WORTH = 0.9
 
 
 def stretched(task: Task, found: Fit, noise: Noise) -> tuple[Task, Fit]:
-    """A settled isometric fit, or that of views with a homogeneous strain where it is by far the better one.
+    """A settled isometric fit, or that of views with a homogeneous strain where it predicts points left out far better.
 
     Strains are tried where ray corrections do not look like noise. Where the search for them comes upon a better
-    isometric fit, that one is taken.
+    isometric fit, that one is gone on with. Costs do not decide: strains lower them on cloth that waves, too, and tilt
+    it.
 
     Args:
         task: what is to be fitted.
@@ -66,12 +68,15 @@ def stretched(task: Task, found: Fit, noise: Noise) -> tuple[Task, Fit]:
             break
         own, best = again, trial
     isometric = _minimum(own, best, replace(best.shape, strain=best.shape.strain[:, :0]))
-    ratio = isometric.first_cost / max(best.first_cost, 1e-300)
-    found.evidence["isometric over stretched cost"] = ratio
+    found.evidence["isometric over stretched cost"] = isometric.first_cost / max(best.first_cost, 1e-300)
     strained = settled(own, best)
-    if wanted == "auto" and ratio < (_ENOUGH if strained.noisy else _PLENTY):
+    if wanted == "auto":
         other = _minimum(task, isometric, isometric.shape)
-        return task, settled(task, other) if other.first_cost < found.first_cost else found
+        if other.first_cost < found.first_cost:
+            found = settled(task, other)
+        without, with_strains = errors_of((found, strained), task.seen)
+        if not clearly_better(_PART, _SURE, with_strains, without):
+            return task, found
     strained.evidence["strain of views"] = strained.shape.strain.tolist()
     return own, strained
 

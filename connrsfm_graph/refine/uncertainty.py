@@ -5,6 +5,9 @@ deviation asked for (the covariance of all depths is far too large to be formed)
 one scale common to all views, lengths that are the same in all views up to noise. Where the ray corrections have
 shown that the surface stretches (see `noise`), the lengths' noise is drawn alike for neighbours, which bends and
 tilts surfaces much more than independent noise of the same size.
+
+How strong the prior on slants is to be the data say roughly, to a factor of e perhaps. By how much depths would move
+with it, the prior's pull, adds to their deviation: where tracks leave slants open, it is most of it.
 """
 
 from __future__ import annotations
@@ -39,7 +42,7 @@ def log_depth_deviation(
     measurements: Measurements,
     shape: Shape,
     stretch: bool,
-    jointly: bool = True,
+    lengths_pull: np.ndarray | None = None,
     about_mean: bool = False,
     seed: int = 0,
 ) -> np.ndarray:
@@ -49,21 +52,49 @@ def log_depth_deviation(
         measurements: with the noise levels of the fit; lengths held tighter than to 0.00125 count as held to that.
         shape: minimum of the cost.
         stretch: whether lengths vary alike for neighbours.
-        jointly: whether the views were fitted together with the lengths. Else the lengths are taken as known, views do
-            not depend on each other, and all have the same draws.
+        lengths_pull: (E,) what `pull` says of the lengths, where those are of other views. They are taken as known but
+            for that, views do not depend on each other, and all have the same draws. None where views and lengths were
+            fitted together.
         about_mean: whether the mean of every view is left out as well, which views from afar do not tell; of views
             fitted together only.
         seed: of the draws.
     """
-    length_weight = np.minimum(measurements.length_weight, 1.0 / _SUREST)
-    measurements = replace(measurements, length_weight=length_weight)
-    draws = _draws(np.random.default_rng(seed), len(shape.log_depth) if jointly else 1, measurements.mesh, stretch)
-    if jointly:
+    measurements = _held(measurements)
+    drawn = len(shape.log_depth) if lengths_pull is None else 1
+    draws = _draws(np.random.default_rng(seed), drawn, measurements.mesh, stretch)
+    if lengths_pull is None:
         variance = _variance_of_all(measurements, shape, draws, about_mean)
     else:
-        variance = _variance_of_each(measurements, shape, draws)
+        variance = _variance_of_each(measurements, shape, draws, lengths_pull)
     # Variances vary slowly over the surface, their estimates from a few draws do not.
     return np.asarray(np.sqrt(_around(variance, measurements.mesh)))
+
+
+def pull(measurements: Measurements, shape: Shape) -> tuple[np.ndarray, np.ndarray]:
+    """By how much the prior on slants moves log depths (F, P) and log lengths (E,) when it grows by a factor of e.
+
+    Args:
+        measurements, shape: as in `log_depth_deviation`, of views and lengths that were fitted together.
+    """
+    measurements = _held(measurements)
+    envelope = measurements.envelope(shape.log_factor.size > 0)
+    equations, _ = linearise(measurements, shape, lag(measurements, shape), envelope)
+    return _pull(measurements, Factorised(equations, envelope, measurements.mesh.edges))
+
+
+def _held(measurements: Measurements) -> Measurements:
+    """With lengths held no tighter than counts."""
+    return replace(measurements, length_weight=np.minimum(measurements.length_weight, 1.0 / _SUREST))
+
+
+def _pull(measurements: Measurements, factorised: Factorised) -> tuple[np.ndarray, np.ndarray]:
+    mesh, frontal, unknown = measurements.mesh, measurements.weights.frontal, factorised.envelope.unknown
+    views = np.zeros_like(factorised.equations.gradient)
+    views[:, unknown] = -0.5 * frontal * np.bincount(mesh.edges.ravel(), minlength=mesh.n_points)
+    border = np.zeros_like(factorised.equations.border_gradient)
+    border[: len(mesh.edges)] = len(views) * frontal
+    views, border = (moved[0] for moved in factorised.solve(views[None], border[None], _TOLERANCE))
+    return views[:, unknown], border[: len(mesh.edges)]
 
 
 def _variance_of_all(
@@ -85,29 +116,36 @@ def _variance_of_all(
         if about_mean:
             error = error - error.mean(axis=-1, keepdims=True)
         square += (error**2).sum(axis=0)
-    return square / _SAMPLES
+    pulled, _ = _pull(measurements, factorised)
+    if about_mean:
+        pulled -= pulled.mean(axis=1, keepdims=True)
+    return square / _SAMPLES + pulled**2
 
 
 def _variance_of_each(
-    measurements: Measurements, shape: Shape, draws: Iterator[tuple[np.ndarray, np.ndarray]]
+    measurements: Measurements,
+    shape: Shape,
+    draws: Iterator[tuple[np.ndarray, np.ndarray]],
+    lengths_pull: np.ndarray,
 ) -> np.ndarray:
-    """The same with the lengths known."""
+    """The same with the lengths known but for what pulls at them."""
     lengths, images = (np.concatenate(parts) for parts in zip(*draws, strict=True))
     envelope = measurements.envelope(shape.log_factor.size > 0)
     square = np.empty_like(shape.log_depth)
     arguments = kernel_arguments(measurements, shape, lag(measurements, shape))
-    over_views(_variance_kernel, len(square), *arguments, envelope, lengths, images, square)
+    over_views(_variance_kernel, len(square), *arguments, envelope, lengths, images, lengths_pull, square)
     return square
 
 
 @njit(cache=True, nogil=True)
 def _variance_kernel(
     first, last, X, f, drift, offset, correction, image_weight, length_weight, factor_weight, terms, envelope,
-    lengths, images, square,
+    lengths, images, lengths_pull, square,
 ):  # fmt: skip
     """Mean squares into `square` (F, P) for views first to last - 1; NaN where a matrix is not positive definite.
 
-    Arguments up to `envelope` are those of `linearise_kernel`, `lengths` (S, E) and `images` (S, P, 2) the draws.
+    Arguments up to `envelope` are those of `linearise_kernel`, `lengths` (S, E) and `images` (S, P, 2) the draws,
+    `lengths_pull` (E,).
     """
     unknown = envelope.unknown
     n, E, m = len(envelope.first), len(terms.edges), len(envelope.first) // len(unknown)
@@ -136,6 +174,14 @@ def _variance_kernel(
             substitute(matrix, envelope.first, envelope.start, gradient)
             for i in range(len(unknown)):
                 square[v, i] += gradient[unknown[i]] ** 2 / len(lengths)
+        gradient[:] = 0.0
+        spread_view(border, weight, ends, lengths_pull, gradient)
+        for e in range(E):
+            for end in range(2):
+                gradient[ends[e, end]] -= 0.5 * terms.weights.frontal
+        substitute(matrix, envelope.first, envelope.start, gradient)
+        for i in range(len(unknown)):
+            square[v, i] += gradient[unknown[i]] ** 2
 
 
 def _draws(rng: np.random.Generator, drawn: int, mesh: Mesh, stretch: bool) -> Iterator[tuple[np.ndarray, np.ndarray]]:

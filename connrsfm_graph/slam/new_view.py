@@ -118,7 +118,8 @@ def from_lengths(start: View, keyframes: list[View], image_sigma: float, length_
     shape = Shape(depths, np.zeros((len(depths), N, 2)), none, log_length(mesh.edges), none)
     shape, cost = fit_views(measurements, shape, _ITERATIONS, _TOLERANCE)
     best = np.array([cost.argmin()])
-    deviation = log_depth_deviation(measurements.views(best), shape.views(best), stretch=False, jointly=False)
+    unmoved = np.zeros_like(shape.log_length)
+    deviation = log_depth_deviation(measurements.views(best), shape.views(best), stretch=False, lengths_pull=unmoved)
     chosen = int(best[0])
     image = start.image + shape.correction[chosen]
     return View.checked(start.points, image, shape.log_depth[chosen], deviation[0])

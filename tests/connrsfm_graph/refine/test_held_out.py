@@ -9,7 +9,7 @@ import pytest
 
 from connrsfm_graph.metrics import evaluate
 from connrsfm_graph.refine import RefineConfig, held_out, refine, settle
-from connrsfm_graph.refine.held_out import HeldOut, gain, within
+from connrsfm_graph.refine.held_out import HeldOut, clearly_better, gain, within
 from connrsfm_graph.refine.measurements import Measurements, Shape
 from connrsfm_graph.refine.noise import Noise
 from connrsfm_graph.refine.solve import minimise
@@ -107,6 +107,16 @@ def test_what_is_worse_by_chance_is_within_one_deviation() -> None:
     assert within(1.0, errors + noise + 0.01, errors)
     assert not within(1.0, errors + noise + 0.02, errors)
     assert within(2.0, errors + noise + 0.02, errors)
+
+
+def test_clearly_better_is_by_a_part_and_beyond_chance() -> None:
+    rng = np.random.default_rng(0)
+    errors, noise = rng.chisquare(2, 50), rng.uniform(-3.0, 3.0, 50)
+    assert clearly_better(0.1, 3.0, 0.8 * errors, errors)
+    assert not clearly_better(0.3, 3.0, 0.8 * errors, errors)
+    assert not clearly_better(0.1, 3.0, 0.8 * errors + noise, errors)
+    assert not clearly_better(0.1, 3.0, 1.2 * errors, errors)
+    assert not clearly_better(0.0, 3.0, errors, errors)
 
 
 def test_fits_go_on_from_those_before() -> None:

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 import pytest
 
 from connrsfm_graph.config import override
 from connrsfm_graph.metrics import evaluate
 from connrsfm_graph.reconstruct import default_config, reconstruct
+from connrsfm_graph.refine import RefineConfig
+from connrsfm_graph.refine.noise import Noise
+from connrsfm_graph.refine.start import start_shape
+from connrsfm_graph.refine.strain import stretched
+from connrsfm_graph.refine.task import Fit, Task, minimised
+from connrsfm_graph.refine.unseen import complete
 from connrsfm_graph.synthetic import varied, with_noise
 from connrsfm_graph.synthetic.jet import Jet
 from connrsfm_graph.synthetic.placing import facing_draws, flat_sheet, placed, rolled, smooth_motion
@@ -50,6 +58,28 @@ def test_pulls_are_found_and_told_from_tilts(seed: int) -> None:
     assert along * np.sign(along @ pulls) == pytest.approx(pulls, abs=0.03)
     without, _ = error(tracks, "refine.stretched=no")
     assert without > 3.0 * found
+
+
+@pytest.mark.parametrize(("part", "taken"), [(0.2, True), (0.1, False), (-0.2, False)])
+def test_strains_are_taken_where_they_predict_points_left_out_far_better(
+    monkeypatch: pytest.MonkeyPatch, part: float, taken: bool
+) -> None:
+    """Whatever they gain in cost."""
+    errors = np.random.default_rng(0).chisquare(2, 500)
+
+    def canned(fits: Iterable[Fit], seen: np.ndarray) -> list[np.ndarray]:
+        return [errors * (1.0 - part if fit.shape.strain.size else 1.0) for fit in fits]
+
+    monkeypatch.setattr("connrsfm_graph.refine.strain.errors_of", canned)
+    tracks = rubber(n_points=40, seed=1)
+    task = Task.of(
+        complete(tracks.normalised(), tracks.visible, np.log(tracks.points[..., 2])), tracks.visible, RefineConfig()
+    )
+    noise = Noise.start(0.5 / tracks.focal_length(), 0.01, task.spacing())
+    measurements = task.measurements(noise, conformal=False)
+    shape, history = minimised(task, measurements, start_shape(task.completed, task.mesh))
+    _, found = stretched(task, Fit(measurements, shape, noise, history, history[-1], noisy=False), noise)
+    assert bool(found.shape.strain.size) == taken
 
 
 def test_exact_pulls_are_found() -> None:

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from connrsfm_graph.refine import RefineConfig, refine
+from connrsfm_graph.refine import RefineConfig, refine, uncertainty
+from connrsfm_graph.refine.measurements import Measurements, Shape
 from connrsfm_graph.refine.mesh import surface_mesh
-from connrsfm_graph.refine.noise import neighbour_correlation
+from connrsfm_graph.refine.noise import Noise, neighbour_correlation
+from connrsfm_graph.refine.solve import minimise
+from connrsfm_graph.refine.start import start_shape
+from connrsfm_graph.refine.task import Task
+from connrsfm_graph.refine.uncertainty import log_depth_deviation, pull
+from connrsfm_graph.refine.unseen import complete
 from connrsfm_graph.synthetic import isometric_bending, spheres, with_noise
 
 
@@ -52,3 +60,31 @@ def test_the_same_input_gives_the_same_result():
     )
     assert (first.points == second.points).all()
     assert (first.depth_std == second.depth_std).all()
+
+
+@pytest.mark.parametrize("strained", [False, True])
+def test_the_pull_of_the_prior_on_slants_is_how_far_it_moves_the_minimum(strained: bool) -> None:
+    """Of shapes and lengths; and of a further view, whose lengths it moves with them."""
+    scene = isometric_bending(n_frames=6, n_points=40, seed=1)
+    image, seen = scene.tracks.normalised(), scene.tracks.visible
+    task = Task.of(complete(image, seen, scene.log_depth), seen, RefineConfig())
+    noise = Noise.start(1e-3, 0.01, task.spacing())
+    shape = start_shape(task.completed, task.mesh)
+    shape = replace(shape, strain=np.zeros((6, 2))) if strained else shape
+
+    def minimum(patches: int) -> tuple[Measurements, Shape]:
+        measurements = task.measurements(replace(noise, patches=patches), conformal=False)
+        return measurements, minimise(measurements, shape, 40, 1e-9, closely=True)[0]
+
+    (measurements, middle), (_, less), (_, more) = (minimum(patches) for patches in (4, 3, 5))
+    depths, lengths = pull(measurements, middle)
+    for found, moved in ((depths, more.log_depth - less.log_depth), (lengths, more.log_length - less.log_length)):
+        assert np.abs(found).max() > 5e-4
+        # What the derivatives leave out, as of arcs, is left out here, too.
+        assert np.linalg.norm(found - 4 / 2 * moved) < 0.25 * np.linalg.norm(found)
+    if not strained:
+        kept = replace(measurements, weights=measurements.weights._replace(frontal=0.0))
+        nothing = np.zeros_like(lengths)
+        by_noise = log_depth_deviation(kept, middle, stretch=False, lengths_pull=nothing) ** 2
+        further = log_depth_deviation(measurements, middle, stretch=False, lengths_pull=lengths) ** 2
+        np.testing.assert_allclose(further - by_noise, uncertainty._around(depths**2, task.mesh), rtol=1e-6)
