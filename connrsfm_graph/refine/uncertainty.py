@@ -71,7 +71,8 @@ def log_depth_deviation(
 
 
 def pull(measurements: Measurements, shape: Shape) -> tuple[np.ndarray, np.ndarray]:
-    """By how much the prior on slants moves log depths (F, P) and log lengths (E,) when it grows by a factor of e.
+    """By how much the prior on slants moves log depths (F, P) and log lengths (E,) when it grows by a factor of e, the
+    scale common to all views left out.
 
     Args:
         measurements, shape: as in `log_depth_deviation`, of views and lengths that were fitted together.
@@ -94,7 +95,8 @@ def _pull(measurements: Measurements, factorised: Factorised) -> tuple[np.ndarra
     border = np.zeros_like(factorised.equations.border_gradient)
     border[: len(mesh.edges)] = len(views) * frontal
     views, border = (moved[0] for moved in factorised.solve(views[None], border[None], _TOLERANCE))
-    return views[:, unknown], border[: len(mesh.edges)]
+    depths, lengths = views[:, unknown], border[: len(mesh.edges)]
+    return depths - depths.mean(), lengths - depths.mean()  # loose edges, of which it is free, shift the mean length
 
 
 def _variance_of_all(
