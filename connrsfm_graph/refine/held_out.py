@@ -72,11 +72,11 @@ def gain(errors: np.ndarray, than: np.ndarray) -> tuple[float, float]:
     return float(difference.mean()), float(difference.std()) / float(np.sqrt(len(difference)))
 
 
-def clearly_better(part: float, deviations: float, errors: np.ndarray, than: np.ndarray) -> bool:
-    """Whether squared errors (N,) are smaller than others by more than a part of these, and by more than so many
-    standard errors of the difference."""
+def part_gained(errors: np.ndarray, than: np.ndarray) -> tuple[float, float]:
+    """By what part of others at the same points squared errors (N,) are smaller, and its standard error."""
+    usual = max(float(_capped(than, than).mean()), 1e-300) if len(than) else 1.0
     better_by, deviation = gain(errors, than)
-    return better_by > 0.0 and better_by > max(part * float(_capped(than, than).mean()), deviations * deviation)
+    return better_by / usual, deviation / usual
 
 
 def within(deviations: float, errors: np.ndarray, best: np.ndarray) -> bool:

@@ -18,7 +18,7 @@ import numpy as np
 
 from connrsfm_graph.refine.caught import reseated_where_dear, restarted_where_dear
 from connrsfm_graph.refine.flatten import flattened
-from connrsfm_graph.refine.held_out import clearly_better, errors_of
+from connrsfm_graph.refine.held_out import errors_of, part_gained
 from connrsfm_graph.refine.measurements import Shape
 from connrsfm_graph.refine.noise import Noise
 from connrsfm_graph.refine.settle import BEYOND_DOUBT, settled
@@ -75,7 +75,9 @@ def stretched(task: Task, found: Fit, noise: Noise) -> tuple[Task, Fit]:
         if other.first_cost < found.first_cost:
             found = settled(task, other)
         without, with_strains = errors_of((found, strained), task.seen)
-        if not clearly_better(_PART, _SURE, with_strains, without):
+        part, deviation = part_gained(with_strains, without)
+        found.evidence["part by which strains lower squared errors of points left out"] = part
+        if part <= max(_PART, _SURE * deviation):
             return task, found
     strained.evidence["strain of views"] = strained.shape.strain.tolist()
     return own, strained

@@ -9,7 +9,7 @@ import pytest
 
 from connrsfm_graph.metrics import evaluate
 from connrsfm_graph.refine import RefineConfig, held_out, refine, settle
-from connrsfm_graph.refine.held_out import HeldOut, clearly_better, gain, within
+from connrsfm_graph.refine.held_out import HeldOut, gain, part_gained, within
 from connrsfm_graph.refine.measurements import Measurements, Shape
 from connrsfm_graph.refine.noise import Noise
 from connrsfm_graph.refine.solve import minimise
@@ -109,14 +109,14 @@ def test_what_is_worse_by_chance_is_within_one_deviation() -> None:
     assert within(2.0, errors + noise + 0.02, errors)
 
 
-def test_clearly_better_is_by_a_part_and_beyond_chance() -> None:
-    rng = np.random.default_rng(0)
-    errors, noise = rng.chisquare(2, 50), rng.uniform(-3.0, 3.0, 50)
-    assert clearly_better(0.1, 3.0, 0.8 * errors, errors)
-    assert not clearly_better(0.3, 3.0, 0.8 * errors, errors)
-    assert not clearly_better(0.1, 3.0, 0.8 * errors + noise, errors)
-    assert not clearly_better(0.1, 3.0, 1.2 * errors, errors)
-    assert not clearly_better(0.0, 3.0, errors, errors)
+def test_a_part_gained_is_of_the_errors_without_and_as_sure_as_they_are_many() -> None:
+    errors = np.random.default_rng(0).chisquare(2, 400)
+    part, deviation = part_gained(0.8 * errors, errors)
+    assert part == pytest.approx(0.2, abs=0.01)
+    assert part_gained(0.8 * errors[:100], errors[:100])[1] == pytest.approx(2.0 * deviation, rel=0.3)
+    assert part_gained(1.2 * errors, errors)[0] < -0.1
+    assert part_gained(errors, errors) == part_gained(errors[:0], errors[:0]) == (0.0, 0.0)
+    assert part_gained(0.0 * errors, 0.0 * errors) == (0.0, 0.0)
 
 
 def test_fits_go_on_from_those_before() -> None:
