@@ -8,8 +8,18 @@
 Each view's H_f is factored by Cholesky inside its envelope: row r is stored from its first non-zero column on, and
 points are ordered by a sweep across the surface, so rows are short. The cost is linear in views. The Schur complement
 S = D - sum_f W_f' H_f^-1 W_f on the border is dense, so it is never formed: conjugate gradients apply it by one
-forward and backward substitution per view. Several right-hand sides at once read each view's factor once for all. What
-one solution has found out about S helps the next (see `memory`).
+forward and backward substitution per view. Several right-hand sides at once read each view's factor once for all.
+
+A length that all views share may change by as much as their noise allows: that of the lengths, and that of the image
+points at both ends, by which every view moves its points to fit. So with D_f = w_f a view's part of D, J_f its
+residuals' derivatives by the ray corrections and A the weights of these, summed over the views,
+
+    S^-1 ~ D^-1 + (1 / F) sum_f J_f A^-1 J_f'
+
+but for what depths give way, little where views differ, and less where lengths have a prior of their own. Without its
+second part the conjugate gradients would take the longer, the more tightly lengths are held. What depths do one
+solution finds out for the next (see `memory`). Strains of different views meet in the lengths only: their parts of S
+are inverted.
 
 A length residual falls by the sum of its shared length and its view's strain times a derivative; all of S acts through
 these sums, one for every residual.
@@ -53,6 +63,8 @@ class NormalEquations:
     """(F, K)."""
     strain_weight: float
     """Weight of the strains' own prior."""
+    ray_weight: np.ndarray
+    """(P,) weight of the ray corrections' own prior, summed over the views; not zero."""
 
     @property
     def border_gradient(self) -> np.ndarray:
@@ -111,6 +123,29 @@ def _schur_terms(begin, end, factor, first, start, border, weight, ends, v, out)
                 out[s, f, e] = weight[f, e] * v[s, f, e] - out[s, f, e]
 
 
+@njit(cache=True, nogil=True)
+def _ray_terms(begin, end, border, ends, give, v, out):
+    """out_sf = J_f diag(give) J_f' v_s for views begin to end - 1, with J_f the derivatives by the ray corrections.
+
+    `give` (n,) is that of every unknown, out (S, F, E).
+    """
+    m = border.shape[2] // 2
+    x = np.empty(len(give))
+    for f in range(begin, end):
+        for s in range(len(v)):
+            x[:] = 0.0
+            for e in range(len(ends)):
+                for c in range(1, 3):
+                    x[ends[e, 0] + c] += border[f, e, c] * v[s, e]
+                    x[ends[e, 1] + c] += border[f, e, m + c] * v[s, e]
+            x *= give
+            for e in range(len(ends)):
+                total = 0.0
+                for c in range(1, 3):
+                    total += border[f, e, c] * x[ends[e, 0] + c] + border[f, e, m + c] * x[ends[e, 1] + c]
+                out[s, f, e] = total
+
+
 class Factorised:
     """Damped normal equations with the views' matrices factored; solves and products with inverses."""
 
@@ -143,11 +178,20 @@ class Factorised:
         self.diagonal = np.concatenate([of_lengths, of_strains.ravel()]) * (1.0 + damping)
         priors = equations.length_weight, np.full(of_strains.size, equations.strain_weight)
         self.prior = np.concatenate(priors) + self.diagonal * (damping / (1.0 + damping))
+        rays = envelope.unknown[:, None] + np.array([1, 2])
+        of_rays = equations.matrix[:, envelope.start[rays + 1] - 1].sum(axis=0)
+        self.give = np.zeros(len(envelope.first))
+        self.give[rays] = 1.0 / (equations.ray_weight[:, None] + damping * of_rays)
+        E, m = len(edges), equations.border.shape[2] // 2
+        by_rays = equations.border[..., [1, 2, m + 1, m + 2]] ** 2
+        variance = (by_rays.mean(axis=0) * np.repeat(self.give[self.ends + 1], 2, axis=1)).sum(axis=1)
+        self.free = 1.0 / np.sqrt(1.0 + self.prior[:E] * (variance + 1.0 / self.diagonal[:E]))
         self.factor = equations.matrix
         fine = np.empty(len(self.factor), dtype=bool)
         over_views(factor_kernel, len(fine), self.factor, damping, envelope.first, envelope.start, fine)
         if not fine.all():
             raise ComputationError("refinement: the normal equations of a view are not positive definite")
+        self.of_strains = self._of_strains()
 
     def solve_views(self, x: np.ndarray) -> np.ndarray:
         """H_f^-1 x_f for all views, shape (S, F, n)."""
@@ -193,21 +237,40 @@ class Factorised:
         product[:, :E] += e.unit**2 * v[:, :E].mean(axis=1, keepdims=True) / E
         return product
 
-    def solve_border(self, rhs: np.ndarray, tolerance: float, limit: int = 500) -> np.ndarray:
-        """S^-1 rhs, shape (S, E + F K), by conjugate gradients preconditioned with the diagonal of D and the memory.
+    def _of_strains(self) -> np.ndarray:
+        """(F, K, K) inverses of the parts of S that belong to the strain of one view."""
+        F, E, K = self.equations.by_strain.shape
+        if not K:
+            return np.zeros((F, 0, 0))
+        each = np.zeros((K, E + F * K))
+        for k in range(K):
+            each[k, E + k :: K] = 1.0
+        parts = self.schur_product(each)[:, E:].reshape(K, F, K)
+        return np.linalg.inv(np.moveaxis(parts, 0, -1))
 
-        Each right-hand side on its own, to `limit` products or a relative `tolerance`: of residuals over the diagonal,
-        whatever the memory.
+    def roughly_solved(self, rhs: np.ndarray) -> np.ndarray:
+        """S^-1 rhs, roughly, shape (S, E + F K): what depths and conformal factors give way to lengths is left out."""
+        F, E = self.equations.weight.shape
+        by_rays = np.empty((len(rhs), F, E))
+        over_views(_ray_terms, F, self.equations.border, self.ends, self.give, self.free * rhs[:, :E], by_rays)
+        lengths = rhs[:, :E] / self.diagonal[:E] + self.free * by_rays.mean(axis=1)
+        strain = np.einsum("fkl,sfl->sfk", self.of_strains, rhs[:, E:].reshape(len(rhs), F, self.of_strains.shape[-1]))
+        return np.concatenate([lengths, strain.reshape(len(rhs), rhs.shape[1] - E)], axis=1)
+
+    def solve_border(self, rhs: np.ndarray, tolerance: float, limit: int = 500) -> np.ndarray:
+        """S^-1 rhs, shape (S, E + F K), by preconditioned conjugate gradients.
+
+        Each right-hand side on its own, to `limit` products or a relative `tolerance`, in the norm of the
+        preconditioner: about that of the cost.
         """
         v, residual = np.zeros_like(rhs), rhs.copy()
-        left = (residual**2 / self.diagonal).sum(axis=1)
-        goal = tolerance**2 * left
-        direction = self.memory.precondition(residual, self.diagonal)
+        direction = self.memory.precondition(residual, self.roughly_solved)
         size = (residual * direction).sum(axis=1)
+        goal = tolerance**2 * size
         directions: deque[np.ndarray] = deque(maxlen=KEPT)
         products: deque[np.ndarray] = deque(maxlen=KEPT)
         for _ in range(limit):
-            active = np.flatnonzero(left > goal)
+            active = np.flatnonzero(size > goal)
             if len(active) == 0:
                 break
             along = direction[active]
@@ -219,8 +282,7 @@ class Factorised:
             part = np.divide(size[active], curvature, out=np.zeros_like(curvature), where=curvature > 0.0)[:, None]
             v[active] += part * along
             residual[active] -= part * product
-            left[active] = (residual[active] ** 2 / self.diagonal).sum(axis=1)
-            z = self.memory.precondition(residual[active], self.diagonal)
+            z = self.memory.precondition(residual[active], self.roughly_solved)
             last, size[active] = size[active], (residual[active] * z).sum(axis=1)
             direction[active] = z + (size[active] / last)[:, None] * along
         self.memory.keep(directions, products)

@@ -179,6 +179,7 @@ def linearise(
         + prior * (shape.log_length - measurements.log_length)
         - (weight * residual).sum(axis=0),
         strain_weight=held,
+        ray_weight=(measurements.image_weight**2).sum(axis=0),
         strain_gradient=held * shape.strain - np.einsum("fe,fek->fk", weight * residual, by_strain),
     )
     return equations, residual

@@ -8,7 +8,7 @@ limited memory quasi-Newton updating, SIAM Journal on Optimization 10, 2000).
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 
 import numpy as np
 from numba import njit
@@ -31,26 +31,30 @@ class Memory:
             self._products = np.array([*self._products, *products][-KEPT:])
             self._curvature = (self._directions * self._products).sum(axis=1)
 
-    def precondition(self, residual: np.ndarray, diagonal: np.ndarray) -> np.ndarray:
-        """Approximate inverse of a matrix that has about this diagonal (n,) times residuals (S, n)."""
-        out = residual.copy()
-        _two_loops(self._directions, self._products, self._curvature, diagonal, out)
+    def precondition(self, residual: np.ndarray, inverse: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        """Approximate inverse times residuals (S, n): a rougher one that is given, updated by BFGS."""
+        out, share = residual.copy(), np.empty((len(residual), len(self._directions)))
+        _first_loop(self._directions, self._products, self._curvature, share, out)
+        out = inverse(out)
+        _second_loop(self._directions, self._products, self._curvature, share, out)
         return out
 
 
 @njit(cache=True)
-def _two_loops(directions, products, curvature, diagonal, x):
-    """BFGS updates of the inverse of a diagonal, by the two-loop recursion, on every row of x (S, n) in place."""
-    m, n = directions.shape
-    share = np.empty(m)
+def _first_loop(directions, products, curvature, share, x):
+    """First loop of the two-loop recursion, on every row of x (S, n) in place; output `share` (S, m)."""
     for row in range(len(x)):
-        for k in range(m - 1, -1, -1):
-            share[k] = np.dot(directions[k], x[row]) / curvature[k]
-            for e in range(n):
-                x[row, e] -= share[k] * products[k, e]
-        for e in range(len(diagonal)):
-            x[row, e] /= diagonal[e]
-        for k in range(m):
-            change = share[k] - np.dot(products[k], x[row]) / curvature[k]
-            for e in range(n):
+        for k in range(len(directions) - 1, -1, -1):
+            share[row, k] = np.dot(directions[k], x[row]) / curvature[k]
+            for e in range(len(x[row])):
+                x[row, e] -= share[row, k] * products[k, e]
+
+
+@njit(cache=True)
+def _second_loop(directions, products, curvature, share, x):
+    """The second loop, likewise."""
+    for row in range(len(x)):
+        for k in range(len(directions)):
+            change = share[row, k] - np.dot(products[k], x[row]) / curvature[k]
+            for e in range(len(x[row])):
                 x[row, e] += change * directions[k, e]

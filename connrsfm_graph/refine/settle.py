@@ -9,8 +9,7 @@ import numpy as np
 
 from connrsfm_graph.refine.held_out import HeldOut, errors_of, gain, within
 from connrsfm_graph.refine.noise import Noise, neighbour_correlation
-from connrsfm_graph.refine.solve import minimise
-from connrsfm_graph.refine.task import Fit, Task, refitted
+from connrsfm_graph.refine.task import Fit, Task, refitted, to_the_end
 
 BEYOND_DOUBT = 0.05
 """A fit that leaves less than this is right, whatever its ray corrections look like."""
@@ -24,9 +23,6 @@ _STEP = 4.0
 """Between levels of the length noise that are compared; in the end one is looked at that lies between two."""
 _LEAST = 0.005
 """Below this part of what it was assumed to be at first it is not lowered again."""
-_CLOSE = (60, 1e-5)
-"""Iterations at most and tolerance of the fit that is taken in the end: where lengths are held tightly the last steps
-are small and many."""
 
 
 def settled(task: Task, found: Fit) -> Fit:
@@ -103,9 +99,7 @@ def trusting_lengths(task: Task, found: Fit) -> Fit:
             taken = between
     for level in (*(level for level in levels[1:] if level.length > taken.length), taken):
         found = refitted(task, found, level)
-    shape, more = minimise(found.measurements, found.shape, *_CLOSE, closely=True)
-    doubt = possible[0].length / taken.length
-    return replace(found, shape=shape, history=found.history + more, length_doubt=doubt)
+    return replace(to_the_end(found), length_doubt=possible[0].length / taken.length)
 
 
 def noise_evidence(task: Task, found: Fit) -> dict[str, Any]:

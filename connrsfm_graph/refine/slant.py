@@ -15,9 +15,12 @@ from connrsfm_graph.refine.held_out import errors_of, gain
 from connrsfm_graph.refine.noise import Noise
 from connrsfm_graph.refine.settle import BEYOND_DOUBT
 from connrsfm_graph.refine.start import start_shape
-from connrsfm_graph.refine.task import Fit, Task, refitted
+from connrsfm_graph.refine.task import Fit, Task, refitted, to_the_end
+from connrsfm_graph.refine.uncertainty import pull
 from connrsfm_graph.threads import mapped
 
+_OPEN = 0.01
+"""Slants are settled where the weakest prior would move surfaces by no more than this part of their relief."""
 _COMPARED, _TAKEN = (12, 3e-4), (60, 1e-4)
 """Iterations at most and tolerance of the fits that are compared, and of the one that is taken: slants move last."""
 _FLATTENED = 0.25
@@ -36,11 +39,14 @@ def seen_frontally(task: Task, found: Fit) -> Fit:
     """
     if found.misfit() < BEYOND_DOUBT or not task.config.frontal_patches:
         return found
+    priors = [replace(found.noise, patches=patches) for patches in task.config.frontal_patches]
+    found.evidence["part of the relief that frontal patches move"] = moved = _moved(task, found, priors[0])
+    if moved <= _OPEN:
+        return found
     compared, taken = (
         replace(task, config=replace(task.config, iterations=iterations, tolerance=tolerance))
         for iterations, tolerance in (_COMPARED, _TAKEN)
     )
-    priors = [replace(found.noise, patches=patches) for patches in task.config.frontal_patches]
     starts = [found, _flattened(found), *_inclined(task, found, priors[0])]
     first = min(mapped(lambda start: refitted(compared, start, priors[0]), starts), key=lambda fit: fit.history[-1])
     without, other = mapped(lambda start: refitted(compared, start, found.noise), (found, first))
@@ -55,7 +61,14 @@ def seen_frontally(task: Task, found: Fit) -> Fit:
         better_by, _ = gain(under_prior, errors)
         if better_by > most:
             best, most = trial, better_by
-    return found if best is found else refitted(taken, best, best.noise)
+    return found if best is found else to_the_end(refitted(taken, best, best.noise))
+
+
+def _moved(task: Task, found: Fit, noise: Noise) -> float:
+    """Root mean square by which the prior would move the log depths of a fit, over that of their relief."""
+    depths, _ = pull(task.measurements(noise, conformal=False), found.shape)
+    relief = found.shape.log_depth - found.shape.log_depth.mean(axis=1, keepdims=True)
+    return float(np.sqrt((depths**2).mean() / np.maximum((relief**2).mean(), 1e-300)))
 
 
 def _inclined(task: Task, found: Fit, noise: Noise) -> list[Fit]:

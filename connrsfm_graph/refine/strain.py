@@ -26,8 +26,9 @@ from connrsfm_graph.refine.start import log_chords, start_shape
 from connrsfm_graph.refine.task import Fit, Task, minimised
 from connrsfm_graph.threads import mapped
 
-_PROMISING = 1.1
-"""Strains must lower the cost by this factor to be looked into: a little they always lower it."""
+_CHEAPER, _HOPE = 1.1, 0.1
+"""A search for strains is worth it where a first fit with them lowers the cost by this factor, which they always do a
+little, and the squared errors of points left out by more than this part."""
 _PART, _SURE = 1.0 / 6.0, 3.0
 """Taken are strains with which points left out are predicted better by this part, and so many standard errors."""
 _PULLED = (0.0, 0.5)
@@ -41,9 +42,9 @@ _WORTH = 0.9
 def stretched(task: Task, found: Fit, noise: Noise) -> tuple[Task, Fit]:
     """A settled isometric fit, or that of views with a homogeneous strain where it predicts points left out far better.
 
-    Strains are tried where ray corrections do not look like noise. Where the search for them comes upon a better
-    isometric fit, that one is gone on with. Costs do not decide: strains lower them on cloth that waves, too, and tilt
-    it.
+    Strains are tried where ray corrections do not look like noise, and are searched for to the end where already a
+    first fit with them promises something. Where the search comes upon a better isometric fit, that one is gone on
+    with. Costs do not decide: strains lower them on cloth that waves, too, and tilt it.
 
     Args:
         task: what is to be fitted.
@@ -57,13 +58,13 @@ def stretched(task: Task, found: Fit, noise: Noise) -> tuple[Task, Fit]:
     if wanted == "no" or (wanted == "auto" and (found.noisy or found.misfit() < BEYOND_DOUBT)):
         return task, found
     own, best = task, _cheapest(task, replace(found, noise=noise))
-    found.evidence["isometric over stretched cost"] = found.first_cost / max(best.first_cost, 1e-300)
-    if wanted == "auto" and found.first_cost < _PROMISING * best.first_cost:
+    if wanted == "auto" and not _promising(task, found, best):
         return task, found
+    best = _not_caught(task, best)
     for _ in range(_ROUNDS):
         mesh, completed = flattened(task.mesh, best.shape.log_length), task.completed
         again = replace(task, mesh=mesh, completed=replace(completed, log_depth=best.shape.log_depth))
-        trial = _cheapest(again, best) if own is task else _minimum(again, best, best.shape)
+        trial = _not_caught(again, _cheapest(again, best)) if own is task else _minimum(again, best, best.shape)
         if trial.first_cost > _WORTH * best.first_cost:
             break
         own, best = again, trial
@@ -74,19 +75,38 @@ def stretched(task: Task, found: Fit, noise: Noise) -> tuple[Task, Fit]:
         other = _minimum(task, isometric, isometric.shape)
         if other.first_cost < found.first_cost:
             found = settled(task, other)
-        without, with_strains = errors_of((found, strained), task.seen)
-        part, deviation = part_gained(with_strains, without)
-        found.evidence["part by which strains lower squared errors of points left out"] = part
+        part, deviation = _predicted_better(task, found, strained)
         if part <= max(_PART, _SURE * deviation):
             return task, found
     strained.evidence["strain of views"] = strained.shape.strain.tolist()
     return own, strained
 
 
+def _promising(task: Task, found: Fit, strained: Fit) -> bool:
+    """Whether a first fit with strains is worth a search for the best one."""
+    found.evidence["isometric over stretched cost"] = found.first_cost / max(strained.first_cost, 1e-300)
+    if found.first_cost < _CHEAPER * strained.first_cost:
+        return False
+    part, _ = _predicted_better(task, found, _minimum(task, found, strained.shape))
+    return part > _HOPE
+
+
+def _predicted_better(task: Task, found: Fit, strained: Fit) -> tuple[float, float]:
+    """By what part strains lower the squared errors of points left out, and its standard error."""
+    without, with_strains = errors_of((found, strained), task.seen)
+    part, deviation = part_gained(with_strains, without)
+    found.evidence["part by which strains lower squared errors of points left out"] = part
+    return part, deviation
+
+
 def _cheapest(task: Task, found: Fit) -> Fit:
-    """The cheapest of the fits with strains from several starts; views that are caught in a wrong shape start again."""
-    best = min(mapped(lambda start: _minimum(task, found, start), _starts(task, found)), key=lambda fit: fit.first_cost)
-    return reseated_where_dear(task, restarted_where_dear(task, best, lend=True))
+    """The cheapest of the fits with strains from several starts."""
+    return min(mapped(lambda start: _minimum(task, found, start), _starts(task, found)), key=lambda fit: fit.first_cost)
+
+
+def _not_caught(task: Task, found: Fit) -> Fit:
+    """The fit, views that are caught in a wrong shape started again."""
+    return reseated_where_dear(task, restarted_where_dear(task, found, lend=True))
 
 
 def _minimum(task: Task, found: Fit, start: Shape) -> Fit:

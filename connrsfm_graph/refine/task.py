@@ -19,6 +19,8 @@ from connrsfm_graph.refine.start import start_mesh, start_shape
 from connrsfm_graph.refine.unseen import Completed
 from factors.frontal import PER_PATCH
 
+_CLOSE = (60, 1e-5)
+"""Iterations at most and tolerance of the last steps to a minimum."""
 _UNIT = 1e3
 """Inverse standard deviation of the mean log length."""
 _DRIFT = 0.3
@@ -151,6 +153,12 @@ class Fit:
 def minimised(task: Task, measurements: Measurements, shape: Shape) -> tuple[Shape, list[float]]:
     """The minimum from a shape, and the costs on the way."""
     return minimise(measurements, shape, task.config.iterations, task.config.tolerance)
+
+
+def to_the_end(found: Fit) -> Fit:
+    """A fit with its last steps, which are small and many where tracks tell little or lengths are held tightly."""
+    shape, more = minimise(found.measurements, found.shape, *_CLOSE, closely=True)
+    return replace(found, shape=shape, history=found.history + more)
 
 
 def refitted(task: Task, found: Fit, noise: Noise) -> Fit:

@@ -214,12 +214,36 @@ def test_a_matrix_that_is_not_positive_definite_is_named():
         Factorised(equations, envelope, measurements.mesh.edges)
 
 
-def test_solutions_are_the_same_with_a_memory_and_take_fewer_products(monkeypatch):
+@pytest.mark.parametrize(("conformal", "strained"), MODELS)
+def test_the_preconditioner_is_the_inverse_where_depths_are_held_and_views_agree(conformal, strained):
+    measurements, shape = _random_problem(conformal, bending=False, seed=4, frontal=0.0, strained=strained)
+    alike = np.zeros(F, dtype=int)
+    held = replace(
+        measurements.views(alike),
+        log_length_weight=np.zeros(len(shape.log_length)),
+        factor_weight=np.full(F, 1e6),
+        strain_weight=1e6,
+        weights=measurements.weights._replace(drift=1e6, huber=1e9),
+    )
+    shape, envelope = shape.views(alike), held.envelope(conformal)
+    equations, _ = linearise(held, shape, lag(held, shape), envelope)
+    factorised = Factorised(equations, envelope, held.mesh.edges)
+    E = len(held.mesh.edges)
+    product = factorised.schur_product(factorised.roughly_solved(np.eye(len(factorised.diagonal))))
+    np.testing.assert_allclose(product[:E, :E], np.eye(E), atol=1e-6)
+
+
+@pytest.fixture
+def products(monkeypatch) -> list[int]:
+    """Right-hand sides of every product with a Schur complement."""
+    made, product = [], Factorised.schur_product
+    monkeypatch.setattr(Factorised, "schur_product", lambda self, v: made.append(len(v)) or product(self, v))
+    return made
+
+
+def test_solutions_are_the_same_with_a_memory_and_take_fewer_products(products):
     measurements, shape = _random_problem(conformal=False, bending=False, seed=3, frontal=0.0)
     envelope, edges = measurements.envelope(False), measurements.mesh.edges
-    products = []
-    product = Factorised.schur_product
-    monkeypatch.setattr(Factorised, "schur_product", lambda self, v: products.append(len(v)) or product(self, v))
     lengths, counts = [], []
     for memory in (Memory(), remembering := Memory(), remembering):
         equations, _ = linearise(measurements, shape, lag(measurements, shape), envelope)

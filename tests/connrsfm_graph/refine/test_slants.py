@@ -118,6 +118,16 @@ def test_exact_data_and_no_patches_leave_nothing_to_assume(monkeypatch: pytest.M
         refined(points, SIGMA)
 
 
+def test_slants_that_tracks_hold_are_not_compared(monkeypatch: pytest.MonkeyPatch) -> None:
+    points = isometric_bending(8, 60, seed=0).tracks.points
+    assert points is not None
+    monkeypatch.setattr("connrsfm_graph.refine.slant.errors_of", never)
+    found = refined(points, 0.1 * SIGMA)
+    assert 0.0 < found.evidence["part of the relief that frontal patches move"] < 0.01
+    with pytest.raises(AssertionError, match="slants were compared"):
+        refined(points, 10.0 * SIGMA)
+
+
 def test_what_is_taken_for_conformal_has_no_slants_compared(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("connrsfm_graph.refine.slant.errors_of", never)
     points = moebius(5, 60).tracks.points
@@ -130,7 +140,7 @@ def test_what_is_taken_for_conformal_has_no_slants_compared(monkeypatch: pytest.
 @pytest.mark.slow
 def test_slants_that_the_data_leave_open_are_nearer_to_the_truth() -> None:
     """And stated to be as open as they are."""
-    scenes = [at_rest(15, 100, seed) for seed in range(2)]
+    scenes = [at_rest(8, 100, seed) for seed in range(2)]
     with_it, without = ([refined(points, SIGMA, patches) for points in scenes] for patches in (None, ()))
     ratios = []
     for points, found, other in zip(scenes, with_it, without, strict=True):
@@ -138,5 +148,5 @@ def test_slants_that_the_data_leave_open_are_nearer_to_the_truth() -> None:
         ratios.append(np.log(errors[0] / errors[1]))
         error = found.log_depth - np.log(points[..., 2])
         normalised = (error - np.median(error)) / (found.depth_std / np.exp(found.log_depth))
-        assert 0.1 < (normalised**2).mean() < 2.0
+        assert 0.05 < (normalised**2).mean() < 2.0
     assert np.exp(np.mean(ratios)) < 0.8

@@ -11,6 +11,8 @@ from connrsfm_graph.config import override
 from connrsfm_graph.metrics import evaluate
 from connrsfm_graph.reconstruct import default_config, reconstruct
 from connrsfm_graph.refine import RefineConfig
+from connrsfm_graph.refine.flatten import flattened
+from connrsfm_graph.refine.mesh import Mesh
 from connrsfm_graph.refine.noise import Noise
 from connrsfm_graph.refine.start import start_shape
 from connrsfm_graph.refine.strain import stretched
@@ -62,18 +64,34 @@ def test_pulls_are_found_and_told_from_tilts(seed: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("part", "points", "taken"), [(0.2, 500, True), (0.2, 6, False), (0.1, 500, False), (-0.2, 500, False)]
+    ("parts", "points", "searches", "taken"),
+    [
+        ((0.2, 0.2), 500, 1, True),
+        ((0.12, 0.2), 500, 1, True),
+        ((0.2, 0.2), 6, 1, False),
+        ((0.2, 0.1), 500, 1, False),
+        ((0.08, 0.2), 500, 0, False),
+        ((-0.2, 0.2), 500, 0, False),
+    ],
 )
 def test_strains_are_taken_where_they_predict_points_left_out_far_better(
-    monkeypatch: pytest.MonkeyPatch, part: float, points: int, taken: bool
+    monkeypatch: pytest.MonkeyPatch, parts: tuple[float, float], points: int, searches: int, taken: bool
 ) -> None:
-    """And surely so, whatever they gain in cost."""
-    errors = np.random.default_rng(0).chisquare(2, points)
+    """And surely so, whatever they gain in cost; they are searched for where already a first fit does it better."""
+    errors, of_fits = np.random.default_rng(0).chisquare(2, points), iter(parts)
+    searched = []
 
     def canned(fits: Iterable[Fit], seen: np.ndarray) -> list[np.ndarray]:
+        part = next(of_fits)
         return [errors * (1.0 - part if fit.shape.strain.size else 1.0) for fit in fits]
 
+    def one_search(mesh: Mesh, log_length: np.ndarray) -> tuple[Mesh, np.ndarray]:
+        searched.append(mesh)
+        return flattened(mesh, log_length)
+
     monkeypatch.setattr("connrsfm_graph.refine.strain.errors_of", canned)
+    monkeypatch.setattr("connrsfm_graph.refine.strain._ROUNDS", 1)
+    monkeypatch.setattr("connrsfm_graph.refine.strain.flattened", one_search)
     tracks = rubber(n_points=40, seed=1)
     task = Task.of(
         complete(tracks.normalised(), tracks.visible, np.log(tracks.points[..., 2])), tracks.visible, RefineConfig()
@@ -83,8 +101,9 @@ def test_strains_are_taken_where_they_predict_points_left_out_far_better(
     shape, history = minimised(task, measurements, start_shape(task.completed, task.mesh))
     _, found = stretched(task, Fit(measurements, shape, noise, history, history[-1], noisy=False), noise)
     assert bool(found.shape.strain.size) == taken
+    assert len(searched) == searches
     assert found.evidence["part by which strains lower squared errors of points left out"] == pytest.approx(
-        part, abs=0.02
+        parts[searches], abs=0.02
     )
 
 
