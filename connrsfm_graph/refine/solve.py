@@ -34,7 +34,7 @@ _EXACT = 1e-6
 """Mean squared length residual, in assumed variances, below which the data are exact and nothing is left to gain."""
 _INNER_TOLERANCE = 0.2
 """Relative accuracy of the conjugate gradients: what they leave the next iteration corrects, as it does curvature."""
-_CLOSE_TOLERANCE = 0.1
+_CLOSE_TOLERANCE = 0.05
 """That of close steps."""
 _COINCIDENT = 1e-300
 """Squared chords are at least so long, as in the factors."""
