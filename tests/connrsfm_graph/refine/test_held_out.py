@@ -162,7 +162,7 @@ def test_the_least_length_noise_that_predicts_as_well_as_the_best_is_taken(
 
 
 def test_fits_that_are_compared_have_forgotten_the_points_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Thorough fits predict about the same at every length noise that is tried; loose ones flatter the tight ones."""
+    """Thorough fits predict about the same at every length noise that is tried."""
     measurements, shape, seen, _ = fitted(0.01, n_frames=12, n_points=100, pixels=1.0)
 
     def errors() -> np.ndarray:
@@ -172,15 +172,11 @@ def test_fits_that_are_compared_have_forgotten_the_points_left_out(monkeypatch: 
         return np.array([left_out.errors(level).mean() for level in levels])[2:]
 
     ours = errors()
-    with monkeypatch.context() as patch:
-        patch.setattr(held_out, "minimise", lambda *arguments, closely: minimise(*arguments))
-        loose = errors()
     for name, value in {"_ITERATIONS": 100, "_TOLERANCE": 1e-6}.items():
         monkeypatch.setattr(held_out, name, value)
     monkeypatch.setattr("connrsfm_graph.refine.solve._CLOSE_TOLERANCE", 0.01)
     thorough = errors()
     np.testing.assert_allclose(ours, thorough, rtol=0.2)
-    assert np.abs(ours - thorough).sum() < 0.8 * np.abs(loose - thorough).sum()
 
 
 @pytest.mark.slow
