@@ -125,25 +125,17 @@ def _schur_terms(begin, end, factor, first, start, border, weight, ends, v, out)
 
 @njit(cache=True, nogil=True)
 def _ray_terms(begin, end, border, ends, give, v, out):
-    """out_sf = J_f diag(give) J_f' v_s for views begin to end - 1, with J_f the derivatives by the ray corrections.
+    """out_sf = J_f diag(give) J_f' v_s for views begin to end - 1, with J_f the derivatives by the views' unknowns.
 
-    `give` (n,) is that of every unknown, out (S, F, E).
+    `give` (n,) is zero but for ray corrections; v (S, E).
     """
-    m = border.shape[2] // 2
-    x = np.empty(len(give))
+    one = np.ones(len(ends))
     for f in range(begin, end):
         for s in range(len(v)):
-            x[:] = 0.0
-            for e in range(len(ends)):
-                for c in range(1, 3):
-                    x[ends[e, 0] + c] += border[f, e, c] * v[s, e]
-                    x[ends[e, 1] + c] += border[f, e, m + c] * v[s, e]
+            x = np.zeros(len(give))
+            spread_view(border[f], one, ends, v[s], x)
             x *= give
-            for e in range(len(ends)):
-                total = 0.0
-                for c in range(1, 3):
-                    total += border[f, e, c] * x[ends[e, 0] + c] + border[f, e, m + c] * x[ends[e, 1] + c]
-                out[s, f, e] = total
+            _gather(border[f], one, ends, x, out[s, f])
 
 
 class Factorised:
@@ -178,14 +170,8 @@ class Factorised:
         self.diagonal = np.concatenate([of_lengths, of_strains.ravel()]) * (1.0 + damping)
         priors = equations.length_weight, np.full(of_strains.size, equations.strain_weight)
         self.prior = np.concatenate(priors) + self.diagonal * (damping / (1.0 + damping))
-        rays = envelope.unknown[:, None] + np.array([1, 2])
-        of_rays = equations.matrix[:, envelope.start[rays + 1] - 1].sum(axis=0)
-        self.give = np.zeros(len(envelope.first))
-        self.give[rays] = 1.0 / (equations.ray_weight[:, None] + damping * of_rays)
-        E, m = len(edges), equations.border.shape[2] // 2
-        by_rays = equations.border[..., [1, 2, m + 1, m + 2]] ** 2
-        variance = (by_rays.mean(axis=0) * np.repeat(self.give[self.ends + 1], 2, axis=1)).sum(axis=1)
-        self.free = 1.0 / np.sqrt(1.0 + self.prior[:E] * (variance + 1.0 / self.diagonal[:E]))
+        self.give = self._given_by_rays(damping)
+        self.free = self._free_of_prior()
         self.factor = equations.matrix
         fine = np.empty(len(self.factor), dtype=bool)
         over_views(factor_kernel, len(fine), self.factor, damping, envelope.first, envelope.start, fine)
@@ -236,6 +222,22 @@ class Factorised:
         product = self.border_part(out) + self.prior * v
         product[:, :E] += e.unit**2 * v[:, :E].mean(axis=1, keepdims=True) / E
         return product
+
+    def _given_by_rays(self, damping: float) -> np.ndarray:
+        """(n,) inverse weights of the ray corrections, summed over the views; zero for other unknowns. Before the
+        views' matrices are factored."""
+        rays = self.envelope.unknown[:, None] + np.array([1, 2])
+        diagonal = self.equations.matrix[:, self.envelope.start[rays + 1] - 1].sum(axis=0)
+        give = np.zeros(len(self.envelope.first))
+        give[rays] = 1.0 / (self.equations.ray_weight[:, None] + damping * diagonal)
+        return give
+
+    def _free_of_prior(self) -> np.ndarray:
+        """(E,) square roots of the parts of what rays allow lengths to change that the lengths' own prior leaves."""
+        E, m = len(self.ends), self.equations.border.shape[2] // 2
+        give = self.give[self.ends[:, :, None] + np.arange(m)].reshape(E, 2 * m)
+        variance = 1.0 / self.diagonal[:E] + ((self.equations.border**2).mean(axis=0) * give).sum(axis=1)
+        return np.asarray(1.0 / np.sqrt(1.0 + self.prior[:E] * variance))
 
     def _of_strains(self) -> np.ndarray:
         """(F, K, K) inverses of the parts of S that belong to the strain of one view."""

@@ -21,8 +21,9 @@ from connrsfm_graph.threads import mapped
 
 _OPEN = 0.01
 """Slants are settled where the weakest prior would move surfaces by no more than this part of their relief."""
-_COMPARED, _TAKEN = (12, 3e-4), (60, 1e-4)
-"""Iterations at most and tolerance of the fits that are compared, and of the one that is taken: slants move last."""
+_COMPARED = (12, 3e-4)
+"""Iterations at most and tolerance of the fits that are compared. Slants move last: the one that is taken goes to its
+end."""
 _FLATTENED = 0.25
 """Part of their relief that surfaces keep in a second start: what is far too steep comes down slowly by itself."""
 _INCLINATION, _DIRECTIONS = 30.0, 6
@@ -43,10 +44,8 @@ def seen_frontally(task: Task, found: Fit) -> Fit:
     found.evidence["part of the relief that frontal patches move"] = moved = _moved(task, found, priors[0])
     if moved <= _OPEN:
         return found
-    compared, taken = (
-        replace(task, config=replace(task.config, iterations=iterations, tolerance=tolerance))
-        for iterations, tolerance in (_COMPARED, _TAKEN)
-    )
+    iterations, tolerance = _COMPARED
+    compared = replace(task, config=replace(task.config, iterations=iterations, tolerance=tolerance))
     starts = [found, _flattened(found), *_inclined(task, found, priors[0])]
     first = min(mapped(lambda start: refitted(compared, start, priors[0]), starts), key=lambda fit: fit.history[-1])
     without, other = mapped(lambda start: refitted(compared, start, found.noise), (found, first))
@@ -61,7 +60,7 @@ def seen_frontally(task: Task, found: Fit) -> Fit:
         better_by, _ = gain(under_prior, errors)
         if better_by > most:
             best, most = trial, better_by
-    return found if best is found else to_the_end(refitted(taken, best, best.noise))
+    return found if best is found else to_the_end(best)
 
 
 def _moved(task: Task, found: Fit, noise: Noise) -> float:

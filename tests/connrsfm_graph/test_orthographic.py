@@ -174,10 +174,12 @@ def test_depths_refined_from_afar_are_about_as_sure_as_they_say(smooth: Tracks) 
     image = smooth.normalised()
     depth = smooth.points[..., 2] - smooth.points[..., 2].mean(axis=1, keepdims=True)
     sigma = 2e-3
-    noisy = image + np.random.default_rng(0).normal(scale=sigma, size=image.shape)
-    refined = refine_from_afar(noisy, smooth.visible, depth, RefineConfig(), sigma)
-    error = (refined.points[..., 2] - depth) / refined.depth_std
-    assert 0.2 < (error**2).mean() < 3.0
+    squares = []
+    for seed in range(4):
+        noisy = image + np.random.default_rng(seed).normal(scale=sigma, size=image.shape)
+        refined = refine_from_afar(noisy, smooth.visible, depth, RefineConfig(), sigma)
+        squares.append((((refined.points[..., 2] - depth) / refined.depth_std) ** 2).mean())
+    assert 0.3 < np.mean(squares) < 3.0
     assert np.isnan(
         refine_from_afar(noisy, smooth.visible, depth, RefineConfig(uncertainty=False), sigma).depth_std
     ).all()

@@ -63,8 +63,9 @@ def test_no_more_points_are_left_out_than_it_takes(monkeypatch: pytest.MonkeyPat
     np.testing.assert_array_equal(fewer, errors[: len(fewer)])
 
 
-def test_what_a_point_left_out_says_is_not_used() -> None:
-    """Image points moved together with the corrections of the start are the same surface, and predicted there."""
+def test_what_a_point_left_out_says_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By fits that have come to their end: where others stop on their way is chance."""
+    monkeypatch.setattr(held_out, "_ITERATIONS", 48)
     measurements, shape, seen, sigma = fitted(0.01)
     before = prediction_errors(measurements, shape, seen)
     # The first part left out is where the errors come first.
@@ -75,7 +76,7 @@ def test_what_a_point_left_out_says_is_not_used() -> None:
     after = prediction_errors(replace(measurements, image=image), shape, seen)
     assert np.sqrt(after[0]) == pytest.approx(50 * sigma, abs=5 * sigma)
     first = np.count_nonzero(part == 0)
-    np.testing.assert_allclose(after[1:first], before[1:first], atol=2.0 * sigma**2)
+    np.testing.assert_allclose(after[1:first], before[1:first], atol=sigma**2)
 
 
 def test_lengths_that_hold_little_predict_worse() -> None:

@@ -148,5 +148,5 @@ def test_slants_that_the_data_leave_open_are_nearer_to_the_truth() -> None:
         ratios.append(np.log(errors[0] / errors[1]))
         error = found.log_depth - np.log(points[..., 2])
         normalised = (error - np.median(error)) / (found.depth_std / np.exp(found.log_depth))
-        assert 0.05 < (normalised**2).mean() < 2.0
+        assert 0.1 < (normalised**2).mean() < 2.0
     assert np.exp(np.mean(ratios)) < 0.8
