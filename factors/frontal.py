@@ -8,7 +8,8 @@ half of -log cos(theta) to second order, so that the same prior is
 
     C = 8 N / E sum over the E edges of e - (b_i + b_k) / 2 - log |x_i - x_k|,
 
-with e the log length of the edge, b the log depths of its ends and x their tracked image points. It is linear, a number
+with e the log length of the edge, b the log depths of its ends and x their tracked image points. A mean that counts
+loose edges less does as well, and must where nothing else would keep them from collapsing. It is linear, a number
 more in the gradient and nothing in the Hessian, and moves shapes most along what the data leave open. It is the
 maximum-depth heuristic (Perriollat, Hartley and Bartoli 2011) as a prior. Patches count as independent in every view:
 of a slant that all views have in common, as before a camera at rest, it is too sure.
@@ -44,7 +45,7 @@ def frontal_factor(
         edge, point_i, point_k, view: indices of the variables: log depths of both points in the view, and the log
             length of the edge.
         image_i, image_k: (2,) tracked points, normalised coordinates.
-        weight: 8 N / E, for N independent patches and E edges a view (see `PER_PATCH`).
+        weight: 8 N / E, for N independent patches and E edges a view (see `PER_PATCH`), or a share of the same sum.
 
     Returns:
         A factor whose error is linear and may be negative. GTSAM eliminates it by Cholesky, its default, not by QR,

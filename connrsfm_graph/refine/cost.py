@@ -33,8 +33,6 @@ class Weights(NamedTuple):
     """Of log depths about their start; weak, it keeps points that nothing else holds from leaving for infinity."""
     unit: float
     """Of the mean log length; it fixes the unit of length."""
-    frontal: float
-    """Cost of an edge's log foreshortening in a view, no standard deviation; 0 where slants are not assumed small."""
 
 
 class Terms(NamedTuple):
@@ -50,6 +48,8 @@ class Terms(NamedTuple):
     """(H, 4) hinge coefficients."""
     log_length: np.ndarray
     """(E,) latent log lengths."""
+    frontal: np.ndarray
+    """(E,) cost of an edge's log foreshortening in a view; zero where slants are not assumed small."""
     weights: Weights
     """See there."""
 
@@ -89,7 +89,7 @@ def view_cost(X, f, drift, offset, correction, image_weight, length_weight, fact
         factor_weight: inverse standard deviation of the log conformal factors.
         terms: what all views share.
     """
-    edges, n_near, hinges, stencils, log_length, weights = terms
+    edges, n_near, hinges, stencils, log_length, frontal, weights = terms
     conformal = len(f) > 0
     total = 0.0
     for e in range(len(edges)):
@@ -101,11 +101,11 @@ def view_cost(X, f, drift, offset, correction, image_weight, length_weight, fact
                 total += 0.5 * (weights.smoothness * (f[i] - f[k])) ** 2
         r = abs(r * length_weight[e])
         total += 0.5 * r * r if r <= weights.huber else weights.huber * (r - 0.5 * weights.huber)
-        if weights.frontal > 0.0:
+        if frontal[e] > 0.0:
             u = X[i, 0] / X[i, 2] - correction[i, 0] - X[k, 0] / X[k, 2] + correction[k, 0]
             v = X[i, 1] / X[i, 2] - correction[i, 1] - X[k, 1] / X[k, 2] + correction[k, 1]
             b_i, b_k = np.log(X[i, 2]), np.log(X[k, 2])
-            total += weights.frontal * log_foreshortening_kernel(u, v, b_i, b_k, log_length[e])
+            total += frontal[e] * log_foreshortening_kernel(u, v, b_i, b_k, log_length[e])
     for i in range(len(X)):
         total += 0.5 * (weights.drift * drift[i]) ** 2
         total += 0.5 * image_weight[i] ** 2 * (correction[i, 0] ** 2 + correction[i, 1] ** 2)
@@ -136,7 +136,7 @@ def linearise_view(
         residual: output (E,) length residuals.
         inverse_variance: output (E,) their weights, robust loss included.
     """
-    edges, n_near, hinges, stencils, log_length, weights = terms
+    edges, n_near, hinges, stencils, log_length, frontal, weights = terms
     conformal = len(f) > 0
     m = 4 if conformal else 3
     row = envelope.start[:-1] - envelope.first
@@ -171,8 +171,8 @@ def linearise_view(
         for c in range(2 * m):
             border[e, c] = J[c]
         _add_row(matrix, row, gradient, at, J, 2 * m, w, r)
-        gradient[at[0]] -= 0.5 * weights.frontal
-        gradient[at[m]] -= 0.5 * weights.frontal
+        gradient[at[0]] -= 0.5 * frontal[e]
+        gradient[at[m]] -= 0.5 * frontal[e]
     for i in range(len(X)):
         n = unknown[i]
         matrix[row[n] + n] += weights.drift**2

@@ -160,6 +160,7 @@ def _fitted(
         factor_weight=fit.measurements.factor_weight[nearest],
         strain_weight=fit.measurements.strain_weight,
         mesh=fit.measurements.mesh,
+        frontal=fit.measurements.frontal,
         weights=fit.measurements.weights,
         arcs=None if fit.measurements.arcs is None else ArcSplines.over(image),
     )

@@ -72,6 +72,9 @@ class Measurements:
     """Inverse standard deviation of the two numbers of a view's strain; not used where views are not stretched."""
     mesh: Mesh
     """Edges and hinges."""
+    frontal: np.ndarray
+    """(E,) cost of an edge's log foreshortening in a view, no standard deviation; zero where slants are not assumed
+    small."""
     weights: Weights
     """Inverse standard deviations of the other terms."""
     arcs: ArcSplines | None = None
@@ -162,7 +165,7 @@ def linearise(
     residual, weight = np.empty((F, E)), np.empty((F, E))
     arguments = kernel_arguments(measurements, shape, lagged)
     over_views(linearise_kernel, F, *arguments, envelope, matrix, gradient, border, residual, weight)
-    unit, frontal = measurements.weights.unit, measurements.weights.frontal
+    unit = measurements.weights.unit
     prior = measurements.log_length_weight**2
     _, by_strain = stretches(shape.strain, measurements.mesh)
     held = measurements.strain_weight**2
@@ -175,7 +178,7 @@ def linearise(
         unit=unit,
         length_weight=prior,
         length_gradient=unit**2 * shape.log_length.mean() / E
-        + F * frontal
+        + F * measurements.frontal
         + prior * (shape.log_length - measurements.log_length)
         - (weight * residual).sum(axis=0),
         strain_weight=held,
@@ -203,8 +206,8 @@ def kernel_arguments(measurements: Measurements, shape: Shape, lagged: Lagged) -
 
 def terms_of(measurements: Measurements, shape: Shape, stencils: np.ndarray) -> Terms:
     """What the kernels take as common to all views."""
-    mesh = measurements.mesh
-    return Terms(mesh.edges, mesh.n_near, mesh.hinges, stencils, shape.log_length, measurements.weights)
+    mesh, frontal = measurements.mesh, measurements.frontal
+    return Terms(mesh.edges, mesh.n_near, mesh.hinges, stencils, shape.log_length, frontal, measurements.weights)
 
 
 def moved(shape: Shape, envelope: Envelope, views: np.ndarray, border: np.ndarray | float) -> Shape:

@@ -45,6 +45,11 @@ class Mesh:
     def n_points(self) -> int:
         return len(self.position)
 
+    def usual(self, value: np.ndarray) -> np.ndarray:
+        """What is usual of the values (E,) of edges about each edge, (E,): the median of near ones at either end."""
+        near = slice(self.n_near)
+        return np.asarray(_medians(self.n_points, self.edges[near], value[near])[self.edges].mean(axis=1))
+
     def order(self) -> np.ndarray:
         """(P,) position of every point in the sweep across the surface whose matrices have the smallest envelope."""
         terms = self.edges if len(self.hinges) == 0 else np.concatenate([self.edges, self.hinges[:, 2:]])
@@ -87,8 +92,9 @@ def surface_mesh(position: np.ndarray, log_length: Callable[[np.ndarray], np.nda
     twin = _twins(position)
     own = np.flatnonzero(twin == np.arange(P))
     triangles = own[triangulate(position[own])]
-    length = np.exp(log_length(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2))).reshape(-1, 3)
-    spacing = _spacing(P, triangles, length)
+    sides = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    length = np.exp(log_length(sides)).reshape(-1, 3)
+    spacing = _medians(P, sides, length.ravel())
     longest = length.argmax(axis=1)
     rows = np.arange(len(triangles))
     ends = spacing[triangles[rows, longest]] + spacing[triangles[rows, (longest + 1) % 3]]
@@ -117,12 +123,11 @@ def _twins(position: np.ndarray) -> np.ndarray:
     return twin
 
 
-def _spacing(n_points: int, triangles: np.ndarray, length: np.ndarray) -> np.ndarray:
-    """(P,) median length of the sides of the triangles around each point."""
-    corner = np.concatenate([triangles[:, [0, 1, 2]].ravel(), triangles[:, [1, 2, 0]].ravel()])
-    around = np.tile(length.ravel(), 2)
-    order = np.argsort(corner, kind="stable")
-    groups = np.split(around[order], np.searchsorted(corner[order], np.arange(1, n_points)))
+def _medians(n_points: int, pairs: np.ndarray, value: np.ndarray) -> np.ndarray:
+    """(P,) median of the values (N,) of the pairs (N, 2) that a point belongs to; zero of none."""
+    order = np.argsort(pairs.ravel(), kind="stable")
+    ends = np.searchsorted(pairs.ravel()[order], np.arange(1, n_points))
+    groups = np.split(np.repeat(value, 2)[order], ends)
     return np.array([np.median(group) if len(group) else 0.0 for group in groups])
 
 

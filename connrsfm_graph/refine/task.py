@@ -29,6 +29,10 @@ _FACTOR = 0.1
 """Inverse standard deviation of log conformal factors."""
 _DECLARED_FACTOR = 1e3
 """The same for views declared isometric."""
+_SHORT = 0.5
+"""Edges are loosened that are shorter than this part of what is usual about them, by the square of how much they are.
+Image noise turns them, and the logarithms of their lengths are far from linear in that: they tell little, and steps of
+the whole fit would be no longer than the shortest edge."""
 
 
 @dataclass(frozen=True)
@@ -82,23 +86,26 @@ class Task:
     def measurements(self, noise: Noise, conformal: bool, declared: bool = True) -> Measurements:
         """Measurements under given noise levels, with or without what is known of views declared isometric."""
         config, start = self.config, start_shape(self.completed, self.mesh)
+        shorter = np.exp(self.mesh.usual(start.log_length) - start.log_length)
+        looseness = noise.looseness * np.maximum(1.0, _SHORT * shorter) ** 2
+        patches = 0.0 if conformal else PER_PATCH * noise.patches
         return Measurements(
             image=self.completed.image,
             image_weight=noise.image_weight(self.seen, self.completed.deviation),
             log_depth=start.log_depth,
             log_length=start.log_length,
             log_length_weight=np.full(len(start.log_length), 0.0 if conformal else noise.prior),
-            length_weight=np.full((len(self.seen), len(self.mesh.edges)), 1.0 / (noise.length * noise.looseness)),
+            length_weight=np.tile(1.0 / (noise.length * looseness), (len(self.seen), 1)),
             factor_weight=np.where(self.declared & declared, _DECLARED_FACTOR, _FACTOR),
             strain_weight=1.0 / config.strain_sigma,
             mesh=self.mesh,
+            frontal=patches / looseness / (1.0 / looseness).sum(),
             weights=Weights(
                 huber=noise.huber,
                 bending=1.0 / config.bending_sigma if config.bending else 0.0,
                 smoothness=1.0 / config.factor_sigma,
                 drift=_DRIFT,
                 unit=_UNIT,
-                frontal=0.0 if conformal else PER_PATCH * noise.patches / len(self.mesh.edges),
             ),
             arcs=self.arcs,
         )

@@ -89,9 +89,9 @@ def _held(measurements: Measurements) -> Measurements:
 
 
 def _pull(measurements: Measurements, factorised: Factorised) -> tuple[np.ndarray, np.ndarray]:
-    mesh, frontal, unknown = measurements.mesh, measurements.weights.frontal, factorised.envelope.unknown
+    mesh, frontal, unknown = measurements.mesh, measurements.frontal, factorised.envelope.unknown
     views = np.zeros_like(factorised.equations.gradient)
-    views[:, unknown] = -0.5 * frontal * np.bincount(mesh.edges.ravel(), minlength=mesh.n_points)
+    views[:, unknown] = -0.5 * np.bincount(mesh.edges.ravel(), np.repeat(frontal, 2), mesh.n_points)
     border = np.zeros_like(factorised.equations.border_gradient)
     border[: len(mesh.edges)] = len(views) * frontal
     views, border = (moved[0] for moved in factorised.solve(views[None], border[None], _TOLERANCE))
@@ -180,7 +180,7 @@ def _variance_kernel(
         spread_view(border, weight, ends, lengths_pull, gradient)
         for e in range(E):
             for end in range(2):
-                gradient[ends[e, end]] -= 0.5 * terms.weights.frontal
+                gradient[ends[e, end]] -= 0.5 * terms.frontal[e]
         substitute(matrix, envelope.first, envelope.start, gradient)
         for i in range(len(unknown)):
             square[v, i] += gradient[unknown[i]] ** 2

@@ -33,7 +33,7 @@ _HELD = 0.1
 """Standard deviation of the first-order terms of keyframes: they are estimates too."""
 _UNKNOWN = 1e-3
 """Weight of a length that no keyframe shows, relative to the others."""
-_WEIGHTS = Weights(huber=1.0, bending=0.0, smoothness=1.0, drift=0.3, unit=1e3, frontal=0.0)
+_WEIGHTS = Weights(huber=1.0, bending=0.0, smoothness=1.0, drift=0.3, unit=1e3)
 """Of the refinement's terms; there is no conformal factor here and the lengths are held."""
 _ITERATIONS, _TOLERANCE = 30, 1e-3
 
@@ -111,6 +111,7 @@ def from_lengths(start: View, keyframes: list[View], image_sigma: float, length_
         factor_weight=np.ones(len(depths)),
         strain_weight=0.0,
         mesh=mesh,
+        frontal=np.zeros(len(mesh.edges)),
         weights=_WEIGHTS,
     )
     N = len(start.points)

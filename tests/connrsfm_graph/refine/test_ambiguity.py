@@ -37,7 +37,8 @@ def true_shape(scene: Scene, rings: int = 1) -> tuple[Measurements, Shape]:
         factor_weight=np.zeros(len(seen)),
         strain_weight=0.0,
         mesh=mesh,
-        weights=Weights(huber=1e9, bending=0.0, smoothness=0.0, drift=0.0, unit=0.0, frontal=0.0),
+        frontal=np.zeros(len(mesh.edges)),
+        weights=Weights(huber=1e9, bending=0.0, smoothness=0.0, drift=0.0, unit=0.0),
     )
     return measurements, shape
 

@@ -53,7 +53,8 @@ def _random_problem(
         factor_weight=rng.uniform(0.1, 1, F),
         strain_weight=4.0,
         mesh=mesh,
-        weights=Weights(huber=1.0, bending=0.5 * bending, smoothness=5.0, drift=1.0, unit=0.0, frontal=frontal),
+        frontal=frontal * rng.uniform(0.5, 1, E),
+        weights=Weights(huber=1.0, bending=0.5 * bending, smoothness=5.0, drift=1.0, unit=0.0),
     )
     return measurements, shape
 
@@ -99,7 +100,7 @@ def _graph(
             offset = lagged.offset[j, e] + more[j, e]
             direction = tuple(mesh.direction[e]) if strained else None
             graph.add(edge_length_factor(e, i, k, j, image[i], image[k], noise, offset, conformal, direction))
-            graph.add(frontal_factor(e, i, k, j, image[i], image[k], weights.frontal))
+            graph.add(frontal_factor(e, i, k, j, image[i], image[k], measurements.frontal[e]))
             if conformal and e < mesh.n_near:
                 graph.add(scale_smoothness_factor(i, k, j, sigma(1, weights.smoothness)))
         if weights.bending > 0:

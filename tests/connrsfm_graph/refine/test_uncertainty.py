@@ -85,7 +85,7 @@ def test_the_pull_of_the_prior_on_slants_is_how_far_it_moves_the_minimum(straine
         # What the derivatives leave out, as of arcs, is left out here, too.
         assert np.linalg.norm(found - 4 / 2 * (moved - scale)) < 0.25 * np.linalg.norm(found)
     if not strained:
-        kept = replace(measurements, weights=measurements.weights._replace(frontal=0.0))
+        kept = replace(measurements, frontal=np.zeros_like(lengths))
         nothing = np.zeros_like(lengths)
         by_noise = log_depth_deviation(kept, middle, stretch=False, lengths_pull=nothing) ** 2
         further = log_depth_deviation(measurements, middle, stretch=False, lengths_pull=lengths) ** 2
