@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from connrsfm_graph.metrics import evaluate
 from connrsfm_graph.refine import RefineConfig
+from connrsfm_graph.refine import task as task_module
 from connrsfm_graph.refine.follow import follow
 from connrsfm_graph.refine.noise import Noise
+from connrsfm_graph.refine.solve import minimise
 from connrsfm_graph.refine.stage import refine
+from connrsfm_graph.refine.start import start_shape
+from connrsfm_graph.refine.task import Task
+from connrsfm_graph.refine.unseen import complete
+from connrsfm_graph.synthetic import isometric_bending
 from connrsfm_graph.synthetic.jet import Jet
 from connrsfm_graph.synthetic.placing import facing_draws, flat_sheet, placed, rolled
 from connrsfm_graph.synthetic.scene import Scene
@@ -102,3 +110,42 @@ def test_in_exact_data_no_edge_is_loose_however_much_it_differs_from_others() ->
     residual = np.full((10, 50), 1e-7)
     residual[:, 3] = 1e-3
     assert Noise.start(1e-3, 0.01, 0.1).after_fit(residual, residual > 0.0).looseness.max() < 1.02
+
+
+def near_twins(noise: float) -> tuple[Task, Noise]:
+    """A noisy sheet on which two points are nearer to each other than a tenth of the spacing, and its noise."""
+    scene = isometric_bending(6, 60, seed=3)
+    points = scene.tracks.points.copy()
+    other = int(np.linalg.norm(points[0] - points[0, 30], axis=-1).argsort()[1])
+    points[:, 30] = 0.92 * points[:, other] + 0.08 * points[:, 30]
+    image = points[..., :2] / points[..., 2:]
+    image += np.random.default_rng(0).normal(0.0, noise, image.shape)
+    seen = np.ones(image.shape[:2], dtype=bool)
+    task = Task.of(complete(image, seen, np.log(points[..., 2])), seen, RefineConfig())
+    return task, Noise.start(noise, 1e-4, task.spacing())
+
+
+def test_short_edges_are_loosened_and_pulled_at_less() -> None:
+    task, noise = near_twins(1e-4)
+    measurements = task.measurements(replace(noise, patches=50), conformal=False)
+    looseness = 1.0 / (noise.length * measurements.length_weight)
+    shorter = np.exp(task.mesh.usual(measurements.log_length) - measurements.log_length)
+    np.testing.assert_allclose(looseness, np.tile(np.maximum(1.0, 0.5 * shorter) ** 2, (6, 1)))
+    assert looseness.max() > 10.0
+    assert np.median(looseness) == 1.0
+    assert measurements.frontal.sum() == pytest.approx(8.0 * 50)
+    np.testing.assert_allclose(measurements.frontal * looseness[0], measurements.frontal.max())
+
+
+def test_a_short_edge_does_not_make_steps_short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first steps under a tenth of the length noise leave less to do."""
+    left = []
+    for part in (task_module._SHORT, 0.0):
+        monkeypatch.setattr(task_module, "_SHORT", part)
+        task, noise = near_twins(1e-3)
+        shape = start_shape(task.completed, task.mesh)
+        for length in (1e-2, 1e-3):
+            measurements = task.measurements(replace(noise, length=length), conformal=False)
+            shape, costs = minimise(measurements, shape, 50, 1e-5, closely=length < 1e-2)
+        left.append(np.array(costs) / min(costs) - 1.0)
+    assert (left[0][1:3] < 0.5 * left[1][1:3]).all()

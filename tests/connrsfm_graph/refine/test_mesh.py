@@ -70,3 +70,16 @@ def test_no_triangle_bridges_a_gap():
 @pytest.mark.parametrize("position", [np.zeros((2, 2)), np.stack([np.arange(9.0), 2 * np.arange(9.0)], -1)])
 def test_points_on_a_line_have_no_triangles(position):
     assert len(triangulate(position)) == 0
+
+
+def test_what_is_usual_of_edges_is_so_about_each():
+    """Half of the points lie ten times nearer to each other; among them, and among the others, two nearly coincide."""
+    rng = np.random.default_rng(0)
+    grid = np.stack(np.meshgrid(np.arange(8.0), np.arange(8.0)), axis=-1).reshape(-1, 2)
+    sparse = grid + rng.uniform(-0.1, 0.1, grid.shape)
+    dense = 0.1 * (grid + rng.uniform(-0.1, 0.1, grid.shape)) + [12.0, 3.5]
+    position = np.concatenate([sparse, dense, sparse[27:28] + 0.05, dense[27:28] + 0.005])
+    mesh = plane_mesh(position)
+    length = np.linalg.norm(position[mesh.edges[:, 0]] - position[mesh.edges[:, 1]], axis=1)
+    short = np.exp(mesh.usual(np.log(length))) / length > 3.0
+    assert {frozenset(pair) for pair in mesh.edges[short].tolist()} == {frozenset((27, 128)), frozenset((91, 129))}
