@@ -57,6 +57,8 @@ class Noise:
     `factors.frontal`)."""
     release: float = 1.0
     """Factor on the uncertainty of interpolated image points."""
+    turns: bool = False
+    """Whether short edges are turned by noise of their ends, and loosened."""
     looseness: np.ndarray = field(default_factory=lambda: np.ones(1), compare=False)
     """(E,) by what factor the length noise of an edge is larger: one that crosses a tear keeps no length. (1,) before a
     fit has shown it."""

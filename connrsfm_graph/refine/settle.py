@@ -28,8 +28,9 @@ _LEAST = 0.005
 def settled(task: Task, found: Fit) -> Fit:
     """The fit with the noise levels that the data show.
 
-    Where the ray corrections look like noise, the image noise stands. Where they do not, it was assumed too large, as
-    long as that leaves the shared lengths where they are: what little noise is left would else crumple all views alike.
+    Where the ray corrections look like noise, the image noise stands, and short edges are loosened in the end. Where
+    they do not, it was assumed too large, as long as that leaves the shared lengths where they are: what little noise
+    is left would else crumple all views alike.
     """
     noisy = found.looks_like_noise(task)
     i, k = task.mesh.edges.T
@@ -46,6 +47,8 @@ def settled(task: Task, found: Fit) -> Fit:
         if noise.image < found.noise.image and moved > noise.length and not freed:
             break
         found = again
+    if noisy and found.misfit() >= BEYOND_DOUBT:
+        found = refitted(task, found, replace(found.noise, turns=True))
     found.evidence.update(noise_evidence(task, found))
     return replace(found, noisy=noisy)
 

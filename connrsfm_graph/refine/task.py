@@ -30,9 +30,9 @@ _FACTOR = 0.1
 _DECLARED_FACTOR = 1e3
 """The same for views declared isometric."""
 _SHORT = 0.5
-"""Edges are loosened that are shorter than this part of what is usual about them, by the square of how much they are.
-Image noise turns them, and the logarithms of their lengths are far from linear in that: they tell little, and steps of
-the whole fit would be no longer than the shortest edge."""
+"""Edges that noise turns are loosened where they are shorter than this part of what is usual about them, by the square
+of how much they are. The logarithms of their lengths are far from linear in that: they tell little, and steps of the
+whole fit would be no longer than the shortest edge. Not so in a conformal model, which has few to spare."""
 
 
 @dataclass(frozen=True)
@@ -86,8 +86,10 @@ class Task:
     def measurements(self, noise: Noise, conformal: bool, declared: bool = True) -> Measurements:
         """Measurements under given noise levels, with or without what is known of views declared isometric."""
         config, start = self.config, start_shape(self.completed, self.mesh)
-        shorter = np.exp(self.mesh.usual(start.log_length) - start.log_length)
-        looseness = noise.looseness * np.maximum(1.0, _SHORT * shorter) ** 2
+        looseness = np.broadcast_to(noise.looseness, start.log_length.shape)
+        if noise.turns and not conformal:
+            shorter = np.exp(self.mesh.usual(start.log_length) - start.log_length)
+            looseness = looseness * np.maximum(1.0, _SHORT * shorter) ** 2
         patches = 0.0 if conformal else PER_PATCH * noise.patches
         return Measurements(
             image=self.completed.image,
