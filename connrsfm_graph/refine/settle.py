@@ -112,6 +112,7 @@ def noise_evidence(task: Task, found: Fit) -> dict[str, Any]:
         "image noise": noise.image,
         "image noise over image length of an edge": float(np.sqrt(2.0)) * noise.image / noise.spacing,
         "length noise": noise.length,
+        "short edges loosened": noise.turns,
         "loose edges": float((noise.looseness > _LOOSE).mean()),
         "patches assumed frontal": noise.patches,
         "root mean square ray correction": float(np.sqrt((correction[task.seen] ** 2).mean())),

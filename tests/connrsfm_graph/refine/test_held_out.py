@@ -35,7 +35,8 @@ def fitted(
     task = Task.of(completed, tracks.visible, RefineConfig())
     shape = start_shape(task.completed, task.mesh)
     for length_sigma in length_sigmas:
-        measurements = task.measurements(Noise.start(sigma, length_sigma, task.spacing()), conformal=False)
+        noise = replace(Noise.start(sigma, length_sigma, task.spacing()), turns=True)
+        measurements = task.measurements(noise, conformal=False)
         shape, _ = minimise(measurements, shape, 30, 1e-4)
     return measurements, shape, tracks.visible, sigma
 
@@ -63,9 +64,8 @@ def test_no_more_points_are_left_out_than_it_takes(monkeypatch: pytest.MonkeyPat
     np.testing.assert_array_equal(fewer, errors[: len(fewer)])
 
 
-def test_what_a_point_left_out_says_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
-    """By fits that have come to their end: where others stop on their way is chance."""
-    monkeypatch.setattr(held_out, "_ITERATIONS", 48)
+def test_what_a_point_left_out_says_is_not_used() -> None:
+    """An image point that is moved, and left out, is predicted where it was, and others hardly notice."""
     measurements, shape, seen, sigma = fitted(0.01)
     before = prediction_errors(measurements, shape, seen)
     # The first part left out is where the errors come first.
@@ -177,7 +177,7 @@ def test_fits_that_are_compared_have_forgotten_the_points_left_out(monkeypatch: 
         monkeypatch.setattr(held_out, name, value)
     monkeypatch.setattr("connrsfm_graph.refine.solve._CLOSE_TOLERANCE", 0.01)
     thorough = errors()
-    np.testing.assert_allclose(ours, thorough, rtol=0.2)
+    np.testing.assert_allclose(ours, thorough, rtol=0.08)
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Edges that keep no length: those that cross a tear."""
+"""Edges that keep no length, as those that cross a tear, or tell little of it: short ones that noise turns."""
 
 from __future__ import annotations
 
