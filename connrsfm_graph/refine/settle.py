@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 
 from connrsfm_graph.refine.held_out import HeldOut, errors_of, gain, within
-from connrsfm_graph.refine.noise import Noise, neighbour_correlation
+from connrsfm_graph.refine.noise import Noise
 from connrsfm_graph.refine.task import Fit, Task, refitted, to_the_end
 
 BEYOND_DOUBT = 0.05
 """A fit that leaves less than this is right, whatever its ray corrections look like."""
+_IN_COMMON = 0.2
+"""Part of their variance that neighbours' ray corrections have in common, beyond which they are not taken for noise."""
 _ROUNDS = 4
 """Fits with noise levels that the one before has shown, at most."""
 _LOOSE = 2.0
@@ -28,11 +30,25 @@ _LEAST = 0.005
 def settled(task: Task, found: Fit) -> Fit:
     """The fit with the noise levels that the data show.
 
-    Where the ray corrections look like noise, the image noise stands, and short edges are loosened in the end. Where
-    they do not, it was assumed too large, as long as that leaves the shared lengths where they are: what little noise
-    is left would else crumple all views alike.
+    Where the ray corrections look like noise, the image noise stands. Where neighbours' corrections have most in
+    common, it was assumed too large. Where they have a little, which many points show to be more than chance, points
+    left out decide: noise that hides a small misfit is noise still.
     """
-    noisy = found.looks_like_noise(task)
+    correlation, chance = found.corrections_in_common(task)
+    if correlation <= chance or correlation > _IN_COMMON or found.conformal or found.misfit() < BEYOND_DOUBT:
+        return _settled(task, found, noisy=correlation <= chance)
+    lowered, standing = (_settled(task, found, noisy) for noisy in (False, True))
+    without, errors = errors_of((lowered, standing), task.seen)
+    better_by, deviation = gain(errors, without)
+    return standing if better_by > _REFUTED * deviation else lowered
+
+
+def _settled(task: Task, found: Fit, noisy: bool) -> Fit:
+    """The same, knowing whether the ray corrections are noise.
+
+    If they are, short edges are loosened in the end. If not, the image noise is lowered as long as that leaves the
+    shared lengths where they are: what little noise is left would else crumple all views alike.
+    """
     i, k = task.mesh.edges.T
     seen = task.seen[:, i] & task.seen[:, k]
     for _ in range(_ROUNDS):
@@ -49,8 +65,9 @@ def settled(task: Task, found: Fit) -> Fit:
         found = again
     if noisy and found.misfit() >= BEYOND_DOUBT:
         found = refitted(task, found, replace(found.noise, turns=True))
+    found = replace(found, noisy=noisy, evidence=dict(found.evidence))
     found.evidence.update(noise_evidence(task, found))
-    return replace(found, noisy=noisy)
+    return found
 
 
 def over_smooth_arcs(task: Task, found: Fit) -> tuple[Task, Fit]:
@@ -116,7 +133,7 @@ def noise_evidence(task: Task, found: Fit) -> dict[str, Any]:
         "loose edges": float((noise.looseness > _LOOSE).mean()),
         "patches assumed frontal": noise.patches,
         "root mean square ray correction": float(np.sqrt((correction[task.seen] ** 2).mean())),
-        "correlation of neighbours' ray corrections": neighbour_correlation(correction, task.seen, task.mesh)[0],
+        "correlation of neighbours' ray corrections": found.corrections_in_common(task)[0],
         "median absolute length residual": float(np.median(np.abs(found.residuals()))),
         "bending": task.config.bending,
         "arcs over smoothed surfaces": task.arcs is not None,
