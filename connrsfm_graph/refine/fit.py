@@ -10,6 +10,7 @@ from connrsfm_graph.refine.ambiguity import resolve
 from connrsfm_graph.refine.caught import RESTARTS, reseated_where_dear, restarted_where_dear
 from connrsfm_graph.refine.measurements import Measurements, Shape
 from connrsfm_graph.refine.noise import Noise
+from connrsfm_graph.refine.planes import from_planes
 from connrsfm_graph.refine.restarts import inverted, restart
 from connrsfm_graph.refine.settle import BEYOND_DOUBT, noise_evidence, over_smooth_arcs, settled, trusting_lengths
 from connrsfm_graph.refine.slant import seen_frontally
@@ -19,6 +20,8 @@ from connrsfm_graph.refine.task import Fit, Task, minimised
 
 _PROMISING = 2.0
 """Views of a second fit are restarted where it costs at most this many times the first."""
+_LED_OUT = 0.8
+"""Part of a cost to which planes that lean must lower it: less is a matter of chance, before noise levels are known."""
 _MISFIT = 1.0
 """Isometry is in doubt where its squared residuals exceed this many assumed variances on average."""
 _DOUBT = 0.15
@@ -53,23 +56,34 @@ def fit(task: Task, sigma_image: float) -> Fit:
 
 
 def fit_isometric(task: Task, noise: Noise) -> Fit:
-    """Isometric fit from the start and, where that leaves a doubt, from flat views; the cheaper one stays.
+    """Isometric fit from the start and, where that leaves a doubt, from planes; the cheapest one stays.
 
     Where even that one misses isometry, views that cost more than others start from what those have found. Views that
     are caught may show only when the noise levels are known, so they are looked for once more in the end.
     """
     found = _from_start(task, noise)
-    misfit = found.misfit()
-    if misfit > _MISFIT or (misfit > BEYOND_DOUBT and not found.looks_like_noise(task)):
-        # The surface may stretch, or the start may be to blame for all views alike; flat ones are neutral.
-        flat = task.flat()
-        again = _from_start(flat, noise, _PROMISING * found.first_cost)
-        if again.first_cost < found.first_cost:
-            task, found = flat, again
+    for plane, worth in _planes(task, found):
+        again = _from_start(plane, noise, _PROMISING * found.first_cost)
+        if again.first_cost < worth * found.first_cost:
+            task, found = plane, again
     if found.misfit() > _MISFIT:
         found = restarted_where_dear(task, found, lend=True)
     found = settled(task, reseated_where_dear(task, found))
     return replace(restarted_where_dear(task, found), first_cost=found.first_cost)
+
+
+def _planes(task: Task, found: Fit) -> list[tuple[Task, float]]:
+    """Planes to start from that may lead further than a fit has come, and to what part of its cost they must.
+
+    The surface may stretch, or the start may be to blame for all views alike; views that face the camera are neutral,
+    and planes that lean lead out of wrong slants.
+    """
+    misfit = found.misfit()
+    if misfit <= BEYOND_DOUBT:
+        return []
+    neutral = [(task.flat(), 1.0)] if misfit > _MISFIT or not found.looks_like_noise(task) else []
+    leaning = from_planes(task, lambda plane: _from_start(plane, found.noise, 0.0))
+    return neutral + [(plane, _LED_OUT) for plane, _ in leaning]
 
 
 def _finished(task: Task, isometric: Fit) -> Fit:

@@ -13,6 +13,7 @@ import numpy as np
 
 from connrsfm_graph.refine.held_out import errors_of, gain
 from connrsfm_graph.refine.noise import Noise
+from connrsfm_graph.refine.planes import from_planes
 from connrsfm_graph.refine.settle import BEYOND_DOUBT
 from connrsfm_graph.refine.start import start_shape
 from connrsfm_graph.refine.task import Fit, Task, refitted, to_the_end
@@ -26,10 +27,6 @@ _COMPARED = (12, 3e-4)
 end."""
 _FLATTENED = 0.25
 """Part of their relief that surfaces keep in a second start: what is far too steep comes down slowly by itself."""
-_INCLINATION, _DIRECTIONS = 30.0, 6
-"""Degrees and number of directions of the inclined planes from which all views start as well."""
-_PROMISING = (6, 2)
-"""So many iterations tell which of them are; so many are gone on with."""
 
 
 def seen_frontally(task: Task, found: Fit) -> Fit:
@@ -46,7 +43,8 @@ def seen_frontally(task: Task, found: Fit) -> Fit:
         return found
     iterations, tolerance = _COMPARED
     compared = replace(task, config=replace(task.config, iterations=iterations, tolerance=tolerance))
-    starts = [found, _flattened(found), *_inclined(task, found, priors[0])]
+    planes = from_planes(task, lambda plane: _from_plane(task, found, priors[0], plane))
+    starts = [found, _flattened(found), *(fit for _, fit in planes)]
     first = min(mapped(lambda start: refitted(compared, start, priors[0]), starts), key=lambda fit: fit.history[-1])
     without, other = mapped(lambda start: refitted(compared, start, found.noise), (found, first))
     if other.history[-1] < without.history[-1]:
@@ -70,22 +68,10 @@ def _moved(task: Task, found: Fit, noise: Noise) -> float:
     return float(np.sqrt((depths**2).mean() / np.maximum((relief**2).mean(), 1e-300)))
 
 
-def _inclined(task: Task, found: Fit, noise: Noise) -> list[Fit]:
-    """What becomes of planes that are inclined alike in all views: the cheapest of several directions.
-
-    Before a camera at rest all views may be caught in the same wrong slant, and none can tell the others.
-    """
-    iterations, kept = _PROMISING
-    quick = replace(task, config=replace(task.config, iterations=iterations))
-
-    def from_plane(angle: float) -> Fit:
-        slope = np.tan(np.radians(_INCLINATION)) * np.array([np.cos(angle), np.sin(angle)])
-        plane = start_shape(task.inclined(slope).completed, task.mesh)
-        plane = replace(plane, strain=np.zeros_like(found.shape.strain))
-        return refitted(quick, replace(found, shape=plane), noise)
-
-    fits = mapped(from_plane, 2.0 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS)
-    return sorted(fits, key=lambda fit: fit.history[-1])[:kept]
+def _from_plane(task: Task, found: Fit, noise: Noise, plane: Task) -> Fit:
+    """A fit from a plane, under the settings that go with it."""
+    shape = replace(start_shape(plane.completed, task.mesh), strain=np.zeros_like(found.shape.strain))
+    return refitted(replace(task, config=plane.config), replace(found, shape=shape), noise)
 
 
 def _flattened(found: Fit) -> Fit:

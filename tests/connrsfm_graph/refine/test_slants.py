@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from connrsfm_graph.metrics import evaluate
 from connrsfm_graph.refine import RefineConfig, Refined, refine, slant
 from connrsfm_graph.refine.noise import Noise
+from connrsfm_graph.refine.planes import from_planes
 from connrsfm_graph.refine.start import start_shape
 from connrsfm_graph.refine.task import Fit, Task
 from connrsfm_graph.refine.unseen import complete
@@ -101,12 +102,12 @@ def test_planes_that_lean_the_right_way_become_the_cheapest_surfaces() -> None:
     noise = Noise.start(SIGMA, 0.01, task.spacing())
     flat = start_shape(task.completed, task.mesh)
     found = Fit(task.measurements(noise, conformal=False), flat, noise, [], 0.0)
-    fits = slant._inclined(task, found, noise)
+    fits = [fit for _, fit in from_planes(task, lambda plane: slant._from_plane(task, found, noise, plane))]
     assert fits[0].history[-1] <= fits[1].history[-1]
     errors = [evaluate(shape.points(image), points).e3d_percent for shape in (fits[0].shape, flat)]
     assert errors[0] < 0.5 * errors[1]
     stretched = replace(found, shape=replace(flat, strain=np.zeros((8, 2))))
-    assert slant._inclined(task, stretched, noise)[0].shape.strain.shape == (8, 2)
+    assert slant._from_plane(task, stretched, noise, task.flat()).shape.strain.shape == (8, 2)
 
 
 def test_exact_data_and_no_patches_leave_nothing_to_assume(monkeypatch: pytest.MonkeyPatch) -> None:
