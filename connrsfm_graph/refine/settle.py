@@ -10,6 +10,7 @@ import numpy as np
 from connrsfm_graph.refine.held_out import HeldOut, errors_of, gain, within
 from connrsfm_graph.refine.noise import Noise
 from connrsfm_graph.refine.task import Fit, Task, refitted, to_the_end
+from connrsfm_graph.threads import mapped
 
 BEYOND_DOUBT = 0.05
 """A fit that leaves less than this is right, whatever its ray corrections look like."""
@@ -37,7 +38,7 @@ def settled(task: Task, found: Fit) -> Fit:
     correlation, chance = found.corrections_in_common(task)
     if correlation <= chance or correlation > _IN_COMMON or found.conformal or found.misfit() < BEYOND_DOUBT:
         return _settled(task, found, noisy=correlation <= chance)
-    lowered, standing = (_settled(task, found, noisy) for noisy in (False, True))
+    lowered, standing = mapped(lambda noisy: _settled(task, found, noisy), (False, True))
     without, errors = errors_of((lowered, standing), task.seen)
     better_by, deviation = gain(errors, without)
     return standing if better_by > _REFUTED * deviation else lowered
