@@ -46,7 +46,8 @@ class Reconstruction:
     conformal_scale: np.ndarray
     """(E, P) conformal scale lambda of each point from image a to image b, NaN where the pair was not observed."""
     depth_std: np.ndarray
-    """(F, P) standard deviation of depth in units of depth, NaN where not estimated."""
+    """(F, P) standard deviation of depth, in the same unit as depth, the scale common to all images left out; NaN where
+    not estimated."""
     log_factor: np.ndarray
     """(F, P) log conformal factor phi of the refinement, zero for an isometric surface, NaN where not estimated."""
     interpolated: np.ndarray

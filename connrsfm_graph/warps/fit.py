@@ -21,6 +21,8 @@ _LINE = 1e-3
 _UNEXPLAINED = 0.5
 # More than this fraction of the points with negative det J: the second image is a mirror image.
 _MIRRORED = 0.5
+# Up to this fraction nothing is said of them: at the border, or beside a wrong track, a smooth warp may well fold.
+_BORDER = 0.03
 
 
 @dataclass(frozen=True)
@@ -184,7 +186,7 @@ def _report(warp: FittedWarp, folded: np.ndarray, spread: float) -> WarpReport:
         problem, usable = f"the second image mirrors the first (det J <= 0 at {count} of {n} points)", False
     elif warp.noise > _UNEXPLAINED:
         problem, usable = f"no smooth warp explains the points (noise is {warp.noise:.0%} of their spread)", False
-    elif count:
+    elif count > _BORDER * n:
         problem = f"the warp is folded (det J <= 0) at {count} of {n} points, which are left out"
     return WarpReport(n, warp.model, rms * spread, count, dict(warp.settings), usable, problem)
 
