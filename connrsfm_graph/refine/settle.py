@@ -14,7 +14,7 @@ from connrsfm_graph.threads import mapped
 
 BEYOND_DOUBT = 0.05
 """A fit that leaves less than this is right, whatever its ray corrections look like."""
-_IN_COMMON = 0.2
+IN_COMMON = 0.2
 """Part of their variance that neighbours' ray corrections have in common, beyond which they are not taken for noise."""
 _ROUNDS = 4
 """Fits with noise levels that the one before has shown, at most."""
@@ -36,7 +36,7 @@ def settled(task: Task, found: Fit) -> Fit:
     left out decide: noise that hides a small misfit is noise still.
     """
     correlation, chance = found.corrections_in_common(task)
-    if correlation <= chance or correlation > _IN_COMMON or found.conformal or found.misfit() < BEYOND_DOUBT:
+    if correlation <= chance or correlation > IN_COMMON or found.conformal or found.misfit() < BEYOND_DOUBT:
         return _settled(task, found, noisy=correlation <= chance)
     lowered, standing = mapped(lambda noisy: _settled(task, found, noisy), (False, True))
     without, errors = errors_of((lowered, standing), task.seen)

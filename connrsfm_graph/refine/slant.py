@@ -20,6 +20,8 @@ from connrsfm_graph.refine.task import Fit, Task, refitted, to_the_end
 from connrsfm_graph.refine.uncertainty import pull
 from connrsfm_graph.threads import mapped
 
+MOVED = "part of the relief that frontal patches move"
+"""What the evidence calls the part by which the weakest prior would move surfaces."""
 _OPEN = 0.01
 """Slants are settled where the weakest prior would move surfaces by no more than this part of their relief."""
 _COMPARED = (12, 3e-4)
@@ -38,7 +40,7 @@ def seen_frontally(task: Task, found: Fit) -> Fit:
     if found.misfit() < BEYOND_DOUBT or not task.config.frontal_patches:
         return found
     priors = [replace(found.noise, patches=patches) for patches in task.config.frontal_patches]
-    found.evidence["part of the relief that frontal patches move"] = moved = _moved(task, found, priors[0])
+    found.evidence[MOVED] = moved = _moved(task, found, priors[0])
     if moved <= _OPEN:
         return found
     iterations, tolerance = _COMPARED

@@ -10,6 +10,7 @@ import numpy as np
 
 from connrsfm_graph.errors import InputError
 from connrsfm_graph.refine.config import RefineConfig
+from connrsfm_graph.refine.doubts import doubts
 from connrsfm_graph.refine.fit import fit
 from connrsfm_graph.refine.follow import Reference, contradicted
 from connrsfm_graph.refine.task import Fit, Task
@@ -125,14 +126,7 @@ def _refined(found: Fit, config: RefineConfig, reference: Reference, outlier: np
     deviation = np.full(seen.shape, np.nan)
     if config.uncertainty:
         deviation = log_depth_deviation(found.doubted(found.measurements), shape, stretch=not found.noisy)
-    warnings = []
     group = np.zeros(len(seen), dtype=int) if found.ambiguity is None else found.ambiguity.group
-    if group.any():
-        warnings.append(
-            f"views {np.flatnonzero(group).tolist()} may be inverted about the camera centre (of an orthographic "
-            "camera: mirrored in depth): the tracks cannot tell, "
-            f"the choice rests on the assumption that {found.ambiguity.assumption}"  # type: ignore[union-attr]
-        )
     return Refined(
         points=all_points(shape.points(image)),
         log_depth=all_points(shape.log_depth),
@@ -148,5 +142,5 @@ def _refined(found: Fit, config: RefineConfig, reference: Reference, outlier: np
         evidence=found.evidence,
         cost_history=tuple(found.history),
         reference=reference,
-        warnings=tuple(warnings),
+        warnings=tuple(doubts(found, seen)),
     )

@@ -80,8 +80,8 @@ def test_noise_that_hides_a_small_misfit_is_noise_still(monkeypatch):
     tracks = replace(noisy, pixels=noisy.pixels + off)
     flat, settings = np.zeros_like(scene.log_depth), RefineConfig(uncertainty=False)
     errors = []
-    for in_common in (settle._IN_COMMON, 0.0):
-        monkeypatch.setattr(settle, "_IN_COMMON", in_common)
+    for in_common in (settle.IN_COMMON, 0.0):
+        monkeypatch.setattr(settle, "IN_COMMON", in_common)
         found = refine(tracks.normalised(), tracks.visible, flat, settings, 2.0 / tracks.focal_length())
         errors.append(evaluate(found.points, tracks.points).e3d_percent)
     assert errors[0] < 0.7 * errors[1]
