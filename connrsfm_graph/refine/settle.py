@@ -35,6 +35,12 @@ def settled(task: Task, found: Fit) -> Fit:
     common, it was assumed too large. Where they have a little, which many points show to be more than chance, points
     left out decide: noise that hides a small misfit is noise still.
     """
+    found = _as_noise_or_not(task, found)
+    found.evidence.update(noise_evidence(task, found))
+    return found
+
+
+def _as_noise_or_not(task: Task, found: Fit) -> Fit:
     correlation, chance = found.corrections_in_common(task)
     if correlation <= chance or correlation > IN_COMMON or found.conformal or found.misfit() < BEYOND_DOUBT:
         return _settled(task, found, noisy=correlation <= chance)
@@ -45,7 +51,7 @@ def settled(task: Task, found: Fit) -> Fit:
 
 
 def _settled(task: Task, found: Fit, noisy: bool) -> Fit:
-    """The same, knowing whether the ray corrections are noise.
+    """The fit with the noise levels that the data show, knowing whether the ray corrections are noise.
 
     If they are, short edges are loosened in the end. If not, the image noise is lowered as long as that leaves the
     shared lengths where they are: what little noise is left would else crumple all views alike.
@@ -66,9 +72,7 @@ def _settled(task: Task, found: Fit, noisy: bool) -> Fit:
         found = again
     if noisy and found.misfit() >= BEYOND_DOUBT:
         found = refitted(task, found, replace(found.noise, turns=True))
-    found = replace(found, noisy=noisy, evidence=dict(found.evidence))
-    found.evidence.update(noise_evidence(task, found))
-    return found
+    return replace(found, noisy=noisy)
 
 
 def over_smooth_arcs(task: Task, found: Fit) -> tuple[Task, Fit]:
