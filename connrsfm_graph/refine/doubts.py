@@ -6,7 +6,6 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from connrsfm_graph.refine.noise import neighbour_correlation
 from connrsfm_graph.refine.settle import BEYOND_DOUBT, IN_COMMON
 from connrsfm_graph.refine.slant import MOVED
 from connrsfm_graph.refine.task import Fit
@@ -30,7 +29,7 @@ def doubts(found: Fit, seen: np.ndarray) -> Iterator[str]:
         )
     if found.conformal or found.misfit() < BEYOND_DOUBT:
         return
-    in_common, chance = neighbour_correlation(found.shape.correction, seen, found.measurements.mesh)
+    in_common, chance = found.corrections_in_common(seen)
     if in_common - chance > IN_COMMON:
         yield (
             f"corrections of neighbouring tracks have {in_common:.0%} of their variance in common: the surface does "

@@ -41,7 +41,7 @@ def settled(task: Task, found: Fit) -> Fit:
 
 
 def _as_noise_or_not(task: Task, found: Fit) -> Fit:
-    correlation, chance = found.corrections_in_common(task)
+    correlation, chance = found.corrections_in_common(task.seen)
     if correlation <= chance or correlation > IN_COMMON or found.conformal or found.misfit() < BEYOND_DOUBT:
         return _settled(task, found, noisy=correlation <= chance)
     lowered, standing = mapped(lambda noisy: _settled(task, found, noisy), (False, True))
@@ -138,7 +138,7 @@ def noise_evidence(task: Task, found: Fit) -> dict[str, Any]:
         "loose edges": float((noise.looseness > _LOOSE).mean()),
         "patches assumed frontal": noise.patches,
         "root mean square ray correction": float(np.sqrt((correction[task.seen] ** 2).mean())),
-        "correlation of neighbours' ray corrections": found.corrections_in_common(task)[0],
+        "correlation of neighbours' ray corrections": found.corrections_in_common(task.seen)[0],
         "median absolute length residual": float(np.median(np.abs(found.residuals()))),
         "bending": task.config.bending,
         "arcs over smoothed surfaces": task.arcs is not None,

@@ -153,13 +153,13 @@ class Fit:
         (F, P), E = self.shape.log_depth.shape, len(self.shape.log_length)
         return 2.0 * self.first_cost / max(F * E - F * P - E, 1)
 
-    def corrections_in_common(self, task: Task) -> tuple[float, float]:
-        """Correlation of neighbours' ray corrections, and its standard error if they are independent."""
-        return neighbour_correlation(self.shape.correction, task.seen, task.mesh)
+    def corrections_in_common(self, seen: np.ndarray) -> tuple[float, float]:
+        """Correlation of neighbours' ray corrections where seen (F, P), and its standard error if independent."""
+        return neighbour_correlation(self.shape.correction, seen, self.measurements.mesh)
 
     def looks_like_noise(self, task: Task) -> bool:
         """Whether neighbours' ray corrections are independent."""
-        correlation, chance = self.corrections_in_common(task)
+        correlation, chance = self.corrections_in_common(task.seen)
         return correlation <= chance
 
 

@@ -163,8 +163,9 @@ def test_the_least_length_noise_that_predicts_as_well_as_the_best_is_taken(
 
 
 def test_fits_that_are_compared_have_forgotten_the_points_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Thorough fits predict about the same, but for the tightest lengths, whose fits have many minima: rounding, and so
-    the machine, decides there in which of them each ends."""
+    """Thorough fits predict about the same. Of the tightest lengths fits of 100 and of 300 iterations do not agree
+    either, and rounding decides: there those that are compared must not predict much too well, as what remembers does.
+    """
     measurements, shape, seen, _ = fitted(0.01, n_frames=12, n_points=100, pixels=1.0)
 
     def errors() -> np.ndarray:
@@ -179,7 +180,7 @@ def test_fits_that_are_compared_have_forgotten_the_points_left_out(monkeypatch: 
     monkeypatch.setattr("connrsfm_graph.refine.solve._CLOSE_TOLERANCE", 0.01)
     thorough = errors()
     np.testing.assert_allclose(ours[:2], thorough[:2], rtol=0.08)
-    np.testing.assert_allclose(ours[2:], thorough[2:], rtol=0.5)
+    assert (ours[2:] > 0.8 * thorough[2:]).all()
 
 
 @pytest.mark.slow

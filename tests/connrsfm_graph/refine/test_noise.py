@@ -66,7 +66,7 @@ def test_points_left_out_decide_where_corrections_have_a_little_in_common(monkey
         return [errors, predicted * by_chance]
 
     monkeypatch.setattr(settle, "errors_of", canned)
-    monkeypatch.setattr(Fit, "corrections_in_common", lambda found, task: (in_common, 0.01))
+    monkeypatch.setattr(Fit, "corrections_in_common", lambda found, seen: (in_common, 0.01))
     found = settle.settled(task, Fit(measurements, shape, noise, history, history[-1]))
     assert found.noisy is noisy
     assert found.evidence["image noise"] == found.noise.image

@@ -126,7 +126,11 @@ def test_mirrored_image_is_reported(model):
     assert warps.valid[0].all()
 
 
-def test_folded_points_are_left_out():
+@pytest.mark.parametrize("few", [False, True])
+def test_folded_points_are_left_out(monkeypatch, few):
+    """And told where they are more than a few."""
+    if few:
+        monkeypatch.setattr("connrsfm_graph.warps.fit._BORDER", 0.2)
     image = smooth_images(200)
     # The right tenth of the sheet is folded over in image 2.
     edge = np.quantile(image[0, :, 0], 0.9)
@@ -137,7 +141,8 @@ def test_folded_points_are_left_out():
     report = warps.reports[0]
     assert report.usable
     assert report.folded > 3
-    assert "folded" in report.problem
+    assert (report.problem is None) is few
+    assert few or "folded" in report.problem
     assert (~warps.valid[0]).sum() == report.folded
     assert beyond[~warps.valid[0]].min() > -1e-9
     np.testing.assert_array_equal(warps.valid[0], np.linalg.det(warps.jets.jacobian[0]) > 0)
