@@ -50,8 +50,9 @@ def mapped(function: Callable[[Item], Result], items: Iterable[Item]) -> Iterato
     """function(item) of every item, in order, each on a thread of its own; what it calls `over_views` stays there.
 
     It pays where most time goes to code that releases the interpreter. Of many small views it makes better use of the
-    threads than sharing out the views of one item after the other.
+    threads than sharing out the views of one item after the other. A single item has all threads.
     """
-    if numba.get_num_threads() == 1:
+    items = list(items)
+    if numba.get_num_threads() == 1 or len(items) == 1:
         return map(function, items)
     return _pool(numba.get_num_threads()).map(function, items)

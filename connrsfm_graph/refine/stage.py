@@ -13,13 +13,15 @@ from connrsfm_graph.refine.config import RefineConfig
 from connrsfm_graph.refine.doubts import doubts
 from connrsfm_graph.refine.fit import fit
 from connrsfm_graph.refine.follow import Reference, contradicted
-from connrsfm_graph.refine.task import Fit, Task
+from connrsfm_graph.refine.task import Task, without
 from connrsfm_graph.refine.uncertainty import log_depth_deviation
 from connrsfm_graph.refine.unseen import complete
 from connrsfm_graph.refine.wrong_tracks import wrong_tracks
 
 _ATTEMPTS = 3
 """Fits without the tracks that the one before has shown to be wrong."""
+_FEW = 0.002
+"""Where no larger part of the observations is shown to be wrong, what a fit has decided is not decided anew."""
 
 
 @dataclass(frozen=True)
@@ -83,13 +85,18 @@ def refine(
     """
     image, visible, log_depth = _checked(image, visible, log_depth, config)
     outlier = wrong_tracks(image, visible) if config.outliers else np.zeros_like(visible)
+    late, found = np.zeros_like(visible), None
     for attempt in range(_ATTEMPTS):
         if progress is not None:
             progress(attempt, _ATTEMPTS)
         used = (visible & ~outlier).any(axis=0)
         seen = (visible & ~outlier)[:, used]
         completed = complete(image[:, used], seen, np.where(outlier, np.nan, log_depth)[:, used])
-        found = fit(Task.of(completed, seen, config), sigma_image)
+        few = late.sum() <= _FEW * seen.sum() and not late[:, ~used].any()
+        if found is None or found.conformal or not few:
+            found = fit(Task.of(completed, seen, config), sigma_image)
+        else:
+            found = without(found, late[:, used], completed)
         late = np.zeros_like(visible)
         reference = Reference(found, completed.template, seen, used)
         late[:, used] = contradicted(found.shape.correction, seen, reference.gross())
@@ -98,7 +105,7 @@ def refine(
         outlier |= late
     if progress is not None:
         progress(_ATTEMPTS, _ATTEMPTS)
-    return _refined(found, config, reference, outlier)
+    return _refined(reference, config, outlier)
 
 
 def _checked(
@@ -121,8 +128,9 @@ def _checked(
     return np.where(visible[..., None], image, 0.0), visible, log_depth
 
 
-def _refined(found: Fit, config: RefineConfig, reference: Reference, outlier: np.ndarray) -> Refined:
-    image, shape, seen, all_points = found.measurements.image, found.shape, reference.seen, reference.all_points
+def _refined(reference: Reference, config: RefineConfig, outlier: np.ndarray) -> Refined:
+    found, seen, all_points = reference.fit, reference.seen, reference.all_points
+    image, shape = found.measurements.image, found.shape
     deviation = np.full(seen.shape, np.nan)
     if config.uncertainty:
         deviation = log_depth_deviation(found.doubted(found.measurements), shape, stretch=not found.noisy)
