@@ -127,6 +127,23 @@ def trusting_lengths(task: Task, found: Fit) -> Fit:
     return replace(to_the_end(found), length_doubt=possible[0].length / taken.length)
 
 
+def without(task: Task, found: Fit, wrong: np.ndarray) -> Fit:
+    """A finished isometric fit that goes on without a few observations.
+
+    Args:
+        task: without them.
+        found: the fit with them.
+        wrong: (F, P) bool, the observations.
+    """
+    before, shape, completed = found.measurements, found.shape, task.completed
+    image = np.where(wrong[..., None], completed.image, before.image)
+    weight = np.where(wrong, found.noise.image_weight(~wrong, completed.deviation), before.image_weight)
+    rays = replace(shape, correction=before.image + shape.correction - image)
+    found = to_the_end(replace(found, measurements=replace(before, image=image, image_weight=weight), shape=rays))
+    found.evidence.update(noise_evidence(task, found))
+    return found
+
+
 def noise_evidence(task: Task, found: Fit) -> dict[str, Any]:
     """What a fit says about the noise."""
     noise, correction = found.noise, found.shape.correction
@@ -141,5 +158,5 @@ def noise_evidence(task: Task, found: Fit) -> dict[str, Any]:
         "correlation of neighbours' ray corrections": found.corrections_in_common(task.seen)[0],
         "median absolute length residual": float(np.median(np.abs(found.residuals()))),
         "bending": task.config.bending,
-        "arcs over smoothed surfaces": task.arcs is not None,
+        "arcs over smoothed surfaces": found.measurements.arcs is not None,
     }

@@ -13,7 +13,8 @@ from connrsfm_graph.refine.config import RefineConfig
 from connrsfm_graph.refine.doubts import doubts
 from connrsfm_graph.refine.fit import fit
 from connrsfm_graph.refine.follow import Reference, contradicted
-from connrsfm_graph.refine.task import Task, without
+from connrsfm_graph.refine.settle import without
+from connrsfm_graph.refine.task import Task
 from connrsfm_graph.refine.uncertainty import log_depth_deviation
 from connrsfm_graph.refine.unseen import complete
 from connrsfm_graph.refine.wrong_tracks import wrong_tracks
@@ -92,11 +93,12 @@ def refine(
         used = (visible & ~outlier).any(axis=0)
         seen = (visible & ~outlier)[:, used]
         completed = complete(image[:, used], seen, np.where(outlier, np.nan, log_depth)[:, used])
+        task = Task.of(completed, seen, config)
         few = late.sum() <= _FEW * seen.sum() and not late[:, ~used].any()
         if found is None or found.conformal or not few:
-            found = fit(Task.of(completed, seen, config), sigma_image)
+            found = fit(task, sigma_image)
         else:
-            found = without(found, late[:, used], completed)
+            found = without(task, found, late[:, used])
         late = np.zeros_like(visible)
         reference = Reference(found, completed.template, seen, used)
         late[:, used] = contradicted(found.shape.correction, seen, reference.gross())

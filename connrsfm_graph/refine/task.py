@@ -179,18 +179,3 @@ def refitted(task: Task, found: Fit, noise: Noise) -> Fit:
     measurements = task.measurements(noise, conformal=found.conformal)
     shape, history = minimised(task, measurements, found.shape)
     return replace(found, measurements=measurements, shape=shape, noise=noise, history=found.history + history)
-
-
-def without(found: Fit, wrong: np.ndarray, completed: Completed) -> Fit:
-    """An isometric fit that goes on without a few observations.
-
-    Args:
-        found: the fit.
-        wrong: (F, P) bool, the observations.
-        completed: the views with these interpolated.
-    """
-    before, shape = found.measurements, found.shape
-    image = np.where(wrong[..., None], completed.image, before.image)
-    weight = np.where(wrong, found.noise.image_weight(~wrong, completed.deviation), before.image_weight)
-    rays = replace(shape, correction=before.image + shape.correction - image)
-    return to_the_end(replace(found, measurements=replace(before, image=image, image_weight=weight), shape=rays))

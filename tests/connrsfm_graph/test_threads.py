@@ -38,3 +38,7 @@ def test_what_has_a_thread_of_its_own_stays_there() -> None:
     assert all(len(threads) == 1 and threads.pop().startswith("connrsfm") for _, threads, _ in found)
     assert [inner for _, _, inner in found] == [[item, item + 1, item + 2] for item in range(20)]
     assert numba.get_num_threads() > 1
+
+
+def test_a_single_item_has_all_threads() -> None:
+    assert list(mapped(lambda _: numba.get_num_threads(), range(1))) == [numba.get_num_threads()]

@@ -180,7 +180,9 @@ def test_fits_that_are_compared_have_forgotten_the_points_left_out(monkeypatch: 
     monkeypatch.setattr("connrsfm_graph.refine.solve._CLOSE_TOLERANCE", 0.01)
     thorough = errors()
     np.testing.assert_allclose(ours[:2], thorough[:2], rtol=0.08)
-    assert (ours[2:] > 0.8 * thorough[2:]).all()
+    ratio = ours[2:] / thorough[2:]
+    assert (ratio > 0.8).all()
+    assert (ratio < 1.5).all()
 
 
 @pytest.mark.slow

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from unittest.mock import Mock
+
 import numpy as np
 import pytest
 
@@ -25,13 +27,13 @@ def test_few_of_them_do_not_start_the_fit_anew(monkeypatch, count, fits):
     wrong.flat[rng.choice(wrong.size, count, replace=False)] = True
     spoiled = np.where(wrong[..., None], image + rng.choice([-8.0, 8.0], image.shape) * sigma, image)
     monkeypatch.setattr(stage, "wrong_tracks", lambda image, visible: np.zeros_like(visible))
-    monkeypatch.setattr(stage, "fit", counted := Counted(stage.fit))
+    monkeypatch.setattr(stage, "fit", fitted := Mock(wraps=stage.fit))
 
     def refined(image: np.ndarray, visible: np.ndarray) -> Refined:
         return refine(image, visible, scene.log_depth, RefineConfig(uncertainty=False), sigma)
 
     found = refined(spoiled, visible)
-    assert counted.calls == fits
+    assert fitted.call_count == fits
     assert found.outlier[wrong].mean() > 0.8
     assert not found.outlier[~wrong].any()
     never = refined(image, visible & ~wrong)
@@ -40,14 +42,3 @@ def test_few_of_them_do_not_start_the_fit_anew(monkeypatch, count, fits):
     assert errors[0] < 1.2 * errors[1]
     extent = float(np.ptp(never.points, axis=1).max())
     assert np.abs(found.points - never.points)[found.outlier].max() < 0.01 * extent
-
-
-class Counted:
-    """A function that counts its calls."""
-
-    def __init__(self, function):
-        self.function, self.calls = function, 0
-
-    def __call__(self, *arguments):
-        self.calls += 1
-        return self.function(*arguments)
